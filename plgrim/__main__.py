@@ -1,0 +1,6 @@
+"""`python -m plgrim` is the command `plgrim`."""
+
+from plgrim.cli import app
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,1 @@
+"""The commands, by what they are for; heavy imports stay inside them, so that each starts quickly."""

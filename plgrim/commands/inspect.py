@@ -1,0 +1,125 @@
+"""`plgrim status`, `healthcheck`, `topics`: how a system is, and what is on the wire."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import urllib.error
+import urllib.request
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from plgrim.commands.options import ConfigFile
+
+if TYPE_CHECKING:
+    from plgrim.config import Config
+
+
+def status(
+    url: Annotated[str | None, typer.Option(help="Of the status service, as http://127.0.0.1:8080.")] = None,
+    config_file: ConfigFile = None,
+) -> None:
+    """Print the status of a running mission as JSON."""
+    from plgrim.config import load_config
+    from plgrim.errors import PlgrimError
+    from plgrim.missions import status_page
+
+    address = (url or status_page(load_config(config_file))).rstrip("/")
+    try:
+        print(json.dumps(_get(f"{address}/api/v1/status"), indent=2))
+    except (OSError, ValueError) as error:
+        raise PlgrimError(
+            f"no status at {address}: {error}; is the mission running (`plgrim up`)?"
+        ) from error
+
+
+def _get(address: str) -> Any:
+    with urllib.request.urlopen(address, timeout=5.0) as response:
+        return json.load(response)
+
+
+def healthcheck(
+    service: Annotated[str, typer.Argument(help="A service, or router.")],
+    config_file: ConfigFile = None,
+    timeout: Annotated[float, typer.Option(help="Wall seconds.")] = 3.0,
+) -> None:
+    """Ask a running service end to end whether it makes progress; exit 0 when it does."""
+    from plgrim.config import load_config
+
+    config = load_config(config_file)
+    try:
+        reason = _status_trouble(config) if service == "status" else _trouble(config, service, timeout)
+    except (OSError, ValueError) as error:
+        reason = str(error)
+    print(f"{service}: {reason or 'healthy'}")
+    sys.exit(1 if reason else 0)
+
+
+def _status_trouble(config: Config) -> str:
+    from plgrim.missions import status_page
+
+    try:
+        _get(f"{status_page(config)}healthz")
+    except urllib.error.HTTPError as error:
+        return f"answers {error.code}"
+    return ""
+
+
+def _trouble(config: Config, service: str, timeout_s: float) -> str:
+    """Why a service is not healthy, or nothing."""
+    from plgrim.errors import NoRouterError
+    from plgrim.runtime.health import ask_health
+    from plgrim.runtime.zenoh_session import connect
+
+    try:
+        with connect(config.router, config.robot, threading.Event(), timeout_s) as link:
+            if service == "router":
+                return ""
+            health = ask_health(link, service, timeout_s)
+    except NoRouterError as error:
+        return str(error)
+    if health is None:
+        return "does not answer"
+    return "" if health.ready else f"not ready: {health.last_error or 'starting'}"
+
+
+def topics() -> None:
+    """Print the table of topics as Markdown."""
+    print(topic_table())
+
+
+def topic_table() -> str:
+    """The table of topics as Markdown; derived from schemas/topics.py."""
+    from schemas.topics import TOPICS
+
+    rows = ["| topic | message | read by | period | queue | at most | stale after | link | what |"]
+    rows.append("|-|-|-|-|-|-|-|-|-|")
+    for topic in TOPICS:
+        cells = [
+            f"`{topic.name}`",
+            topic.message.__name__,
+            " ".join(topic.readers) or "the result",
+            _span(topic.period_ns) or "on events",
+            "all" if topic.keep_all else "latest",
+            f"{topic.max_bytes // 1024} KiB",
+            _span(topic.stale_after_ns) or "never",
+            "yes" if topic.crosses_link else "no",
+            topic.says,
+        ]
+        rows.append(f"| {' | '.join(cells)} |")
+    rows.append(
+        "| `<service>/health` | StageHealth | status | 0.5 s | latest | 16 KiB | 3 s | yes | health of each service |"
+    )
+    return "\n".join(rows)
+
+
+def _span(span_ns: int) -> str:
+    return f"{span_ns / 1e9:g} s" if span_ns else ""
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    for command in (status, healthcheck, topics):
+        app.command()(command)

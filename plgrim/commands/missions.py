@@ -1,0 +1,145 @@
+"""`plgrim demo`, `explore`, `up`, `watch`: whole missions."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from plgrim.commands.options import ConfigFile, OutFolder, Speed, put
+
+if TYPE_CHECKING:
+    from plgrim.config import Config
+
+_DEMO_WORLD = "subway_1x"
+
+
+def demo(
+    seed: Annotated[int, typer.Option(min=0, help="Of the world and of every random stream.")] = 1,
+    speed: Annotated[float, typer.Option(min=0.01, max=100, help="Mission seconds a wall second.")] = 2.0,
+    out: OutFolder = Path("out/demo"),
+    config_file: ConfigFile = None,
+) -> None:
+    """Explore a built-in world, every service a process of its own; exit 0 when it was covered."""
+    overrides: dict[str, Any] = {"seed": seed, "clock": {"speed": speed}, "sim": {"world": _DEMO_WORLD}}
+    _live(_prepare(config_file, overrides), out)
+
+
+def explore(
+    world: Annotated[str | None, typer.Option(help="Built-in world: subway_1x, subway_2x, ...")] = None,
+    map_file: Annotated[
+        Path | None, typer.Option("--map", help="ROS map_server YAML file instead of a built-in world.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the world and of every random stream.")] = None,
+    start: Annotated[
+        tuple[float, float] | None, typer.Option(metavar="X Y", help="Start in the map's frame, m.")
+    ] = None,
+    lockstep: Annotated[bool, typer.Option("--lockstep", help="One process, virtual clock.")] = False,
+    speed: Speed = None,
+    time_budget: Annotated[float | None, typer.Option(min=1, help="Mission time, s.")] = None,
+    out: OutFolder = Path("out/explore"),
+    config_file: ConfigFile = None,
+) -> None:
+    """Explore a world or a map until it is covered; exit 0 when it was."""
+    if world is not None and map_file is not None:
+        raise typer.BadParameter("--world and --map exclude each other")
+    overrides: dict[str, Any] = {}
+    put(overrides, "seed", seed)
+    put(overrides, "clock.speed", speed)
+    put(overrides, "sim.world", world)
+    put(overrides, "sim.map_file", None if map_file is None else str(map_file.resolve()))
+    put(overrides, "sim.start", None if start is None else {"x_m": start[0], "y_m": start[1]})
+    put(overrides, "mission.time_budget_s", time_budget)
+    config = _prepare(config_file, overrides)
+    if lockstep:
+        _lockstep(config, out)
+    else:
+        _live(config, out)
+
+
+def up(
+    keep: Annotated[bool, typer.Option("--keep", help="Go on after the mission's end.")] = False,
+    speed: Speed = None,
+    out: OutFolder = Path("out/up"),
+    config_file: ConfigFile = None,
+) -> None:
+    """Start the router and all services as configured, and watch over them until the mission's end or Ctrl-C."""
+    overrides: dict[str, Any] = {}
+    put(overrides, "clock.speed", speed)
+    _live(_prepare(config_file, overrides), out, until_end=not keep)
+
+
+def watch(out: OutFolder = Path("out/watch"), config_file: ConfigFile = None) -> None:
+    """Join a running system, show its progress and write the result folder at the mission's end."""
+    from plgrim.logs import configure_logs
+    from plgrim.missions import watch as watch_mission
+    from plgrim.runtime.process import die_with_parent, stop_on_signals
+
+    die_with_parent()
+    configure_logs("watch")
+    config = _prepare(config_file, {})
+    with stop_on_signals() as stop:
+        result = watch_mission(config, out, stop, _console())
+    _finish(result, out)
+
+
+def _prepare(config_file: Path | None, overrides: dict[str, Any]) -> Config:
+    """The whole configuration, every section checked: before anything starts."""
+    from plgrim.config import check_all, load_config
+
+    config = load_config(config_file, overrides)
+    check_all(config)
+    return config
+
+
+def _console() -> Any:
+    from rich.console import Console
+
+    return Console()
+
+
+def _live(config: Config, out: Path, until_end: bool = True) -> None:
+    import time
+
+    from plgrim.logs import configure_logs
+    from plgrim.missions import run_live, status_address
+    from plgrim.runtime.process import die_with_parent, stop_on_signals
+    from plgrim.runtime.router import check_port_free
+
+    die_with_parent()
+    configure_logs("plgrim")
+    check_port_free(
+        *status_address(config), "choose another for the status page with PLGRIM_STATUS__PORT, or status.port"
+    )
+    if config.clock.source == "monotonic" and not config.clock.origin_ns:
+        clock = config.clock.model_copy(update={"origin_ns": time.monotonic_ns()})
+        config = config.model_copy(update={"clock": clock})
+    with stop_on_signals() as stop:
+        result = run_live(config, out, stop, _console(), until_end)
+    _finish(result, out)
+
+
+def _lockstep(config: Config, out: Path) -> None:
+    from plgrim.logs import configure_logs
+    from plgrim.missions import run_lockstep
+
+    configure_logs("plgrim")
+    _finish(run_lockstep(config, out, _console()), out)
+
+
+def _finish(result: dict[str, Any], out: Path) -> None:
+    from plgrim.progress import stage_table, summary_table
+
+    console = _console()
+    console.print(summary_table(result))
+    console.print(stage_table(result))
+    console.print(f"result in {out}/: result.json, trajectory.csv, coverage.png, map.png", highlight=False)
+    sys.exit(0 if result["succeeded"] else 1)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    for command in (demo, explore, up, watch):
+        app.command()(command)

@@ -1,0 +1,63 @@
+"""`plgrim run SERVICE` and `plgrim router`: one process of the system."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from plgrim.commands.options import ConfigFile
+
+
+def run(
+    service: Annotated[str, typer.Argument(help="riskmap, irm, gcp, lcp, reconciler, mission, sim, status")],
+    config_file: ConfigFile = None,
+) -> None:
+    """Run one service in this process until Ctrl-C."""
+    from plgrim.config import load_config
+    from plgrim.logs import configure_logs
+    from plgrim.registry import STAGES
+    from plgrim.runtime.process import die_with_parent, stop_on_signals
+
+    die_with_parent()
+    if service not in (*STAGES, "status"):
+        raise typer.BadParameter(f"no service {service!r}; there are {', '.join((*STAGES, 'status'))}")
+    configure_logs(service)
+    config = load_config(config_file)
+    with stop_on_signals() as stop:
+        if service == "status":
+            from plgrim.runtime.status_service import run_status
+
+            run_status(config, stop)
+        else:
+            from plgrim.runtime.live import run_stage
+
+            run_stage(service, config, stop)
+
+
+def router(
+    config_file: ConfigFile = None,
+    listen: Annotated[
+        str | None, typer.Option(help="Endpoint, as tcp/127.0.0.1:7457 (default: router.endpoint).")
+    ] = None,
+) -> None:
+    """Run the Zenoh router of this host until Ctrl-C."""
+    from plgrim.commands.options import put
+    from plgrim.config import load_config
+    from plgrim.logs import configure_logs
+    from plgrim.runtime.process import die_with_parent, stop_on_signals
+    from plgrim.runtime.router import run_router
+
+    die_with_parent()
+    configure_logs("router")
+    overrides: dict[str, object] = {}
+    put(overrides, "router.endpoint", listen)
+    config = load_config(config_file, overrides)
+    with stop_on_signals() as stop:
+        run_router(config.router, stop)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command()(run)
+    app.command()(router)

@@ -1,0 +1,256 @@
+"""The configuration: one optional YAML or TOML file, `PLGRIM_...` in the environment, options of the command line.
+
+Later ones win: defaults, file, environment, command line. A key that no section knows is refused at any depth, with
+the file (or variable), the path of the key and the nearest key there is. `PLGRIM_SIM__LIDAR__RINGS=8` sets
+`sim.lidar.rings`; `PLGRIM_ROUTER`, `PLGRIM_SPEED` and `PLGRIM_CLOCK_ORIGIN_NS` are short for `router.endpoint`,
+`clock.speed` and `clock.origin_ns`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import tomllib
+from collections.abc import Mapping
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
+
+from plgrim.config_keys import check_env_name, check_keys, describe
+from plgrim.errors import ConfigError
+from plgrim.registry import STAGES
+
+PREFIX = "PLGRIM_"
+_FILE: ContextVar[str] = ContextVar("configuration_file", default="")
+_SHORT = {"ROUTER": "router.endpoint", "SPEED": "clock.speed", "CLOCK_ORIGIN_NS": "clock.origin_ns"}
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class RouterConfig(_Section):
+    """The Zenoh router of this host, and how clients reach it."""
+
+    endpoint: str = Field("tcp/127.0.0.1:7457", pattern=r"^(tcp|tls|quic|ws|unixsock-stream)/.+")
+    """Where the router listens and clients connect. `tcp/0.0.0.0:7457` listens on every interface."""
+    connect: str = ""
+    """Where clients connect when it is not `endpoint` (in containers: `tcp/router:7457`). Empty: `endpoint`."""
+    shared_memory: bool = False
+    """Zenoh's shared memory transport: less copying of large maps; leaves files in /dev/shm after a kill -9."""
+    lease_ms: int = Field(2000, ge=200, le=60_000)
+    """Silence after which a connection counts as lost, ms. Lower finds a dead peer sooner."""
+
+    @property
+    def client_endpoint(self) -> str:
+        """The endpoint that a client connects to."""
+        return self.connect or self.endpoint
+
+
+class ClockConfig(_Section):
+    """The mission clock: stamp = (clock - origin_ns) * speed, the same in all processes."""
+
+    speed: float = Field(1.0, gt=0, le=100)
+    """Mission seconds a wall second. Above what the machine can compute, planners fall behind."""
+    origin_ns: int = Field(0, ge=0)
+    """Reading of `source` at mission clock 0, ns."""
+    source: Literal["monotonic", "realtime"] = "monotonic"
+    """monotonic: one host (shared by all its processes and containers). realtime: hosts whose clocks are synchronised."""
+
+
+class RuntimeConfig(_Section):
+    """How processes are run, watched and restarted. Wall time throughout."""
+
+    health_period_s: float = Field(0.5, gt=0, le=10)
+    max_consecutive_errors: int = Field(20, ge=1)
+    """So many steps in a row that raise end the process; the supervisor starts it anew."""
+    start_timeout_s: float = Field(300.0, gt=0)
+    """Until all services are ready; the first start compiles kernels."""
+    router_timeout_s: float = Field(30.0, gt=0)
+    """How long a service started by itself waits for a router."""
+    unresponsive_after_s: float = Field(15.0, gt=0)
+    """A service without a sign of health for so long is killed and restarted."""
+    restarts: int = Field(5, ge=0)
+    """Restarts of one service allowed within `restart_window_s`; one more ends the run."""
+    restart_window_s: float = Field(120.0, gt=0)
+    backoff_s: float = Field(0.5, ge=0)
+    """Wait before the first restart; doubles with each further one."""
+    stop_timeout_s: float = Field(3.0, gt=0)
+    """Grace between SIGTERM and SIGKILL."""
+
+
+class Config(BaseSettings):
+    """Everything. The sections of services are checked by the service's own `Config`, loaded when asked for."""
+
+    model_config = SettingsConfigDict(frozen=True, extra="forbid")
+
+    robot: str = Field("robot", pattern=r"^[A-Za-z0-9_-]{1,32}$")
+    """Name of the robot: part of every key on the wire."""
+    seed: int = Field(1, ge=0, lt=2**63)
+    """The mission's seed; every random stream is derived from it."""
+    router: RouterConfig = RouterConfig()
+    clock: ClockConfig = ClockConfig()
+    runtime: RuntimeConfig = RuntimeConfig()
+    riskmap: dict[str, Any] = Field(default_factory=dict)
+    irm: dict[str, Any] = Field(default_factory=dict)
+    gcp: dict[str, Any] = Field(default_factory=dict)
+    lcp: dict[str, Any] = Field(default_factory=dict)
+    reconciler: dict[str, Any] = Field(default_factory=dict)
+    mission: dict[str, Any] = Field(default_factory=dict)
+    sim: dict[str, Any] = Field(default_factory=dict)
+    status: dict[str, Any] = Field(default_factory=dict)
+
+    _source: str = PrivateAttr("configuration")
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Command line, environment, file: each checked for unknown keys before they are merged."""
+        return (init_settings, _EnvironmentSource(settings_cls), _FileSource(settings_cls))
+
+    def options(self, service: str) -> dict[str, Any]:
+        """The section of a service; the simulator's seed is the mission's unless it has its own."""
+        section: dict[str, Any] = dict(getattr(self, service))
+        if service == "sim":
+            section.setdefault("seed", self.seed)
+        return section
+
+
+class _FileSource(PydanticBaseSettingsSource):
+    def get_field_value(self, field: Any, field_name: str) -> tuple[Any, str, bool]:
+        raise NotImplementedError
+
+    def __call__(self) -> dict[str, Any]:
+        path = _FILE.get()
+        if not path:
+            return {}
+        content = _read(Path(path))
+        check_keys(content, Config, path, "")
+        return content
+
+
+class _EnvironmentSource(PydanticBaseSettingsSource):
+    def get_field_value(self, field: Any, field_name: str) -> tuple[Any, str, bool]:
+        raise NotImplementedError
+
+    def __call__(self) -> dict[str, Any]:
+        nested: dict[str, Any] = {}
+        for variable, path in environment_overrides(os.environ).items():
+            *parents, last = path.split(".")
+            into = nested
+            for part in parents:
+                into = into.setdefault(part, {})
+            into[last] = yaml.safe_load(os.environ[variable])
+            check_keys(_nest(path), Config, variable, "")
+        return nested
+
+
+def _nest(path: str) -> dict[str, Any]:
+    head, _, rest = path.partition(".")
+    return {head: _nest(rest) if rest else None}
+
+
+def environment_overrides(environment: Mapping[str, str]) -> dict[str, str]:
+    """Variables that set a key of the configuration: name -> path of the key. ConfigError for a misspelt one."""
+    found: dict[str, str] = {}
+    for variable in sorted(environment):
+        if not variable.startswith(PREFIX):
+            continue
+        name = variable.removeprefix(PREFIX)
+        if name in _SHORT:
+            found[variable] = _SHORT[name]
+        elif "__" in name or name.lower() in ("robot", "seed"):
+            found[variable] = name.lower().replace("__", ".")
+        else:
+            check_env_name(variable, ("ROBOT", "SEED", *_SHORT))
+    return found
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = tomllib.loads(text) if path.suffix == ".toml" else yaml.safe_load(text)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: neither YAML nor TOML: {error}") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected sections and keys, found {type(content).__name__}")
+    return content
+
+
+def load_config(path: Path | None = None, overrides: Mapping[str, Any] | None = None) -> Config:
+    """The configuration from a file (default: `$PLGRIM_CONFIG`, or none), the environment and `overrides` (nested).
+
+    Only the program's own sections are checked here; `check_service` checks a service's. Raises ConfigError.
+    """
+    file = str(path) if path is not None else os.environ.get("PLGRIM_CONFIG", "")
+    token = _FILE.set(file)
+    try:
+        config = Config(**dict(overrides or {}))
+    except ValidationError as error:
+        raise ConfigError(describe(error, file or "configuration")) from error
+    finally:
+        _FILE.reset(token)
+    config._source = file or "configuration"
+    return config
+
+
+def service_config_class(service: str) -> type[BaseModel] | None:
+    """The `Config` of a service: in its `stage` module, or for status in its `config` module."""
+    module = "stage" if service in STAGES else "config"
+    try:
+        found = importlib.import_module(f"services.{service}.{module}")
+    except ModuleNotFoundError as error:
+        if error.name and error.name.startswith("services"):
+            return None
+        raise
+    config: type[BaseModel] = getattr(found, "Config", None) or found.StatusConfig
+    return config
+
+
+def check_service(config: Config, service: str) -> BaseModel | None:
+    """The service's own configuration, validated; None when the service has none.
+
+    Raises ConfigError with file or variable, path of the key, and what is wrong.
+    """
+    model = service_config_class(service)
+    options = config.options(service)
+    if model is None:
+        if getattr(config, service):
+            raise ConfigError(f"{config._source}: {service}: this service has no configuration")
+        return None
+    if "seed" not in model.model_fields and "seed" not in getattr(config, service):
+        options.pop("seed", None)
+    for variable, key in environment_overrides(os.environ).items():
+        if key.startswith(f"{service}."):
+            check_keys(_nest(key.partition(".")[2]), model, f"environment: {variable}", service)
+    check_keys(options, model, config._source, service)
+    try:
+        return model.model_validate(options)
+    except ValidationError as error:
+        raise ConfigError(describe(error, config._source, service)) from error
+
+
+def check_all(config: Config) -> None:
+    """Check every service's section that is not empty, so that a misspelt key is found before anything starts."""
+    for service in (*STAGES, "status"):
+        if getattr(config, service):
+            check_service(config, service)
+
+
+def write_config(config: Config, path: Path) -> None:
+    """Write the whole configuration as YAML: what a child process reads instead of file, environment and options."""
+    path.write_text(yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False), encoding="utf-8")

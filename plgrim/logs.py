@@ -1,0 +1,39 @@
+"""Structured logs: key=value lines for people, JSON where a program reads them (`PLGRIM_LOG_JSON=1`)."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from typing import Any
+
+import structlog
+
+
+def configure_logs(service: str = "", level: int = logging.INFO) -> None:
+    """Write logs to standard error, one line an event, each with its service. Call once a process."""
+    as_json = os.environ.get("PLGRIM_LOG_JSON", "") not in ("", "0")
+    renderer: Any = (
+        structlog.processors.JSONRenderer()
+        if as_json
+        else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty())
+    )
+    structlog.configure(
+        processors=[
+            structlog.contextvars.merge_contextvars,
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.format_exc_info,
+            renderer,
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(level),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=False,
+    )
+    if service:
+        structlog.contextvars.bind_contextvars(service=service)
+
+
+def get_logger() -> Any:
+    """The logger (structlog's bound loggers carry no useful static type)."""
+    return structlog.get_logger()

@@ -1,0 +1,174 @@
+"""Whole missions: live with all services as processes, in lock-step, or watched from outside; each gives a result."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from plgrim.config import Config, service_config_class
+from plgrim.evaluation.recorder import RECORDED, MissionRecorder
+from plgrim.logs import get_logger
+from plgrim.progress import MissionProgress
+from plgrim.registry import STAGES
+from plgrim.runtime.supervisor import Command, Supervisor, plgrim_command
+from plgrim.runtime.zenoh_session import Link, connect
+from schemas.base import Message
+from schemas.codec import decode
+from schemas.contract import SECOND_NS, Topic
+from schemas.errors import MessageError
+from schemas.topics import SERVICES
+
+Result = dict[str, Any]
+_LAST_WORDS_S = 6.0
+_LOST_GRACE_S = 5.0
+
+
+def world_name(config: Config) -> str:
+    """The world or map that the simulator is told to use, for titles and results."""
+    map_file = config.sim.get("map_file")
+    if map_file:
+        return Path(str(map_file)).stem
+    if "world" in config.sim:
+        return str(config.sim["world"])
+    model = service_config_class("sim")
+    return str(model.model_fields["world"].default) if model and "world" in model.model_fields else "-"
+
+
+def status_address(config: Config) -> tuple[str, int]:
+    """Host and port of the status service."""
+    model = service_config_class("status")
+    fields = model.model_fields if model else {}
+    host = config.status.get("host", fields["host"].default if "host" in fields else "127.0.0.1")
+    port = config.status.get("port", fields["port"].default if "port" in fields else 8080)
+    return str(host), int(port)
+
+
+def status_page(config: Config) -> str:
+    """Address of the status page as a person on this host opens it."""
+    host, port = status_address(config)
+    return f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else host}:{port}/"  # noqa: S104
+
+
+def attach_recorder(link: Link, recorder: MissionRecorder) -> None:
+    """Have the recorder observe everything it needs over a link."""
+
+    def receive(topic: Topic[Message], payload: bytes) -> None:
+        try:
+            message, envelope = decode(payload, topic.message, topic.max_bytes)
+        except MessageError as error:
+            get_logger().warning("recorder: message refused", topic=topic.name, reason=str(error))
+            return
+        recorder.observe(topic, message, envelope.sent_ns)
+
+    for topic in RECORDED:
+        link.subscribe(topic, receive, every=True)
+
+
+def run_live(
+    config: Config,
+    out_dir: Path,
+    stop: threading.Event,
+    console: Console,
+    until_end: bool = True,
+    services: tuple[str, ...] = SERVICES,
+    command: Command = plgrim_command,
+) -> Result:
+    """Run all services as processes until the mission ends or `stop`; write and give the result.
+
+    until_end: False goes on after the mission's end. Raises PlgrimError when the services cannot run.
+    """
+    recorder = MissionRecorder(config.seed, world_name(config), "live", config.clock.speed)
+    out_dir.mkdir(parents=True, exist_ok=True)
+    began = time.monotonic()
+    with (
+        Supervisor(config, out_dir, services, command) as supervisor,
+        MissionProgress(recorder, status_page(config), console) as progress,
+    ):
+        link = supervisor.start()
+        attach_recorder(link, recorder)
+        if supervisor.wait_ready(stop, progress.waiting):
+            _follow(recorder, stop, progress.update, supervisor.poll, until_end)
+        recorder.restarts = {c.name: c.restarted for c in supervisor.children.values() if c.restarted}
+    return recorder.write(out_dir, extra={"wall_s": round(time.monotonic() - began, 1)})
+
+
+def watch(config: Config, out_dir: Path, stop: threading.Event, console: Console) -> Result:
+    """Join a running system as one more client, follow the mission to its end, write and give the result."""
+    recorder = MissionRecorder(config.seed, world_name(config), "live", config.clock.speed)
+    began = time.monotonic()
+    with (
+        connect(config.router, config.robot, stop, config.runtime.start_timeout_s) as link,
+        MissionProgress(recorder, "", console) as progress,
+    ):
+        attach_recorder(link, recorder)
+        _follow(recorder, stop, progress.update, lambda: None, True)
+    return recorder.write(out_dir, extra={"wall_s": round(time.monotonic() - began, 1)})
+
+
+def _follow(
+    recorder: MissionRecorder,
+    stop: threading.Event,
+    update: Callable[[], None],
+    poll: Callable[[], None],
+    until_end: bool,
+) -> None:
+    """Until the mission ends, the robot has been lost for a while, or `stop`; then wait for the last words."""
+    lost_since: float | None = None
+    while not stop.wait(0.1):
+        poll()
+        update()
+        if recorder.lost:
+            lost_since = lost_since or time.monotonic()
+        is_lost = lost_since is not None and time.monotonic() - lost_since > _LOST_GRACE_S
+        if until_end and (recorder.finished or is_lost):
+            _last_words(recorder, stop, update)
+            return
+
+
+def _last_words(recorder: MissionRecorder, stop: threading.Event, update: Callable[[], None]) -> None:
+    """Wait for a judgement and a picture from after the end, so that the result shows the end."""
+    ended_ns = recorder.mission.stamp_ns if recorder.mission else 0
+    deadline = time.monotonic() + _LAST_WORDS_S
+    while time.monotonic() < deadline and not stop.wait(0.1):
+        update()
+        judge, picture = recorder.judge, recorder.picture
+        if judge and picture and min(judge.stamp_ns, picture.stamp_ns) >= ended_ns:
+            return
+
+
+def run_lockstep(config: Config, out_dir: Path, console: Console, limit_s: float = 0.0) -> Result:
+    """Run the mission in this process under a virtual clock, as fast as the machine can; write and give the result.
+
+    limit_s: stop after so much mission time (0: the mission's own end). Ctrl-C ends it early, with a result.
+    """
+    from plgrim.runtime.lockstep import Lockstep
+
+    recorder = MissionRecorder(config.seed, world_name(config), "lockstep")
+    options = {name: config.options(name) for name in STAGES}
+    lockstep = Lockstep(options, config.seed, config.robot, recorder.observe)
+    began = time.monotonic()
+    lost_ns = 0
+    with MissionProgress(recorder, "", console) as progress:
+        try:
+            while not recorder.finished and not (limit_s and lockstep.now >= limit_s * SECOND_NS):
+                lockstep.run_until(lockstep.now + SECOND_NS)
+                progress.update()
+                lost_ns += SECOND_NS if recorder.lost else 0
+                if lost_ns > _LOST_GRACE_S * SECOND_NS:
+                    break
+            lockstep.run_until(lockstep.now + int(_LAST_WORDS_S) * SECOND_NS)
+        except KeyboardInterrupt:
+            console.print("interrupted: writing the result so far")
+    wall_s = time.monotonic() - began
+    extra = {
+        "wall_s": round(wall_s, 1),
+        "times_real_time": lockstep.now / SECOND_NS / max(wall_s, 1e-9),
+        "digest": lockstep.digest(),
+        "dropped": lockstep.dropped(),
+    }
+    return recorder.write(out_dir, lockstep.step_seconds(), extra)

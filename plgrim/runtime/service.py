@@ -1,0 +1,93 @@
+"""What every live service shares, stage or not: session, one instance only, heartbeat, answer to health checks."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+import zenoh
+
+from plgrim.config import Config
+from plgrim.errors import AlreadyRunningError
+from plgrim.logs import get_logger
+from plgrim.runtime.clock import MissionClock
+from plgrim.runtime.health import Heartbeat, HealthMonitor, query_key, token_key
+from plgrim.runtime.mailbox import Outbox
+from plgrim.runtime.zenoh_session import Link, connect
+from schemas.contract import Output, Stamp
+from schemas.operation import StageHealth
+from schemas.topics import health_topic
+
+
+class LiveService:
+    """A service's life on the wire; a context manager.
+
+    report: gives the health message (called from the heartbeat's thread). epoch: wall-clock ms at the start, so that
+    it grows from life to life. Raises NoRouterError, AlreadyRunningError.
+    """
+
+    def __init__(
+        self, name: str, config: Config, stop: threading.Event, monitor: HealthMonitor | None = None
+    ) -> None:
+        self.name = name
+        self.config = config
+        self.clock = MissionClock.of(config.clock)
+        self.epoch = time.time_ns() // 1_000_000
+        self.monitor = monitor or HealthMonitor(name)
+        self.mailbox_report: Callable[[Stamp], tuple[dict[str, int], list[str]]] = lambda _: ({}, [])
+        self.link: Link = connect(config.router, config.robot, stop, config.runtime.router_timeout_s)
+        self._outbox = Outbox(config.robot, name, self.epoch)
+        self._last = b""
+        try:
+            self._refuse_second_instance()
+            self.link.answer(query_key(config.robot, name), self._answer)
+        except BaseException:
+            self.link.close()
+            raise
+        self._heartbeat = Heartbeat(config.runtime.health_period_s, self._beat)
+
+    def __enter__(self) -> LiveService:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._heartbeat.stop()
+        self.link.close()
+
+    def _refuse_second_instance(self) -> None:
+        """Declare a token, then look for older ones: of two that start together the older one stays."""
+        robot = self.config.robot
+        mine = token_key(robot, self.name, f"{time.time_ns():020d}-{os.getpid()}")
+        self.link.token(mine)
+        for attempt in range(2):  # the token of a process that was just killed may live for a moment
+            others = [key for key in self.link.tokens(token_key(robot, self.name, "*")) if key < mine]
+            if not others:
+                return
+            if attempt == 0:
+                time.sleep(0.5)
+        pid = others[0].rpartition("-")[2]
+        raise AlreadyRunningError(
+            f"{self.name} of robot {robot!r} is already running (process {pid}) at this router: stop it first, "
+            "or give this one another robot name with PLGRIM_ROBOT"
+        )
+
+    def health(self) -> StageHealth:
+        """The health message of this moment."""
+        now = self.clock.now_ns()
+        dropped, waiting_for = self.mailbox_report(now)
+        return self.monitor.report(now, dropped, waiting_for)
+
+    def _beat(self) -> None:
+        topic = health_topic(self.name)
+        try:
+            self._last = self._outbox.pack(Output(topic, self.health()), self.clock.now_ns(), {})
+            self.link.publish(topic, self._last)
+        except (zenoh.ZError, ValueError) as error:
+            get_logger().warning("heartbeat failed", error=str(error))
+
+    def _answer(self) -> bytes:
+        return self._last

@@ -1,0 +1,81 @@
+"""The status service live: its core fed over Zenoh, its HTTP server, its requests for the whole graph."""
+
+from __future__ import annotations
+
+import threading
+from typing import cast
+
+from plgrim.config import Config, check_service
+from plgrim.errors import PortTakenError
+from plgrim.logs import get_logger
+from plgrim.runtime.clock import MissionClock
+from plgrim.runtime.mailbox import Mailbox, Outbox
+from plgrim.runtime.service import LiveService
+from schemas.base import Message
+from schemas.contract import Output, Topic
+from schemas.topics import STATUS_GRAPH_REQUEST, read_by
+from services.status import app
+from services.status.config import Config as StatusConfig
+
+_TICK_S = 0.2
+
+
+class StatusFeed:
+    """Takes payloads of any topic of the status, refuses as every mailbox does, and shows the rest to the core."""
+
+    def __init__(self, robot: str, shared: app.SharedStatus, clock: MissionClock) -> None:
+        self._mailbox = Mailbox(robot, tuple(read_by("status")))
+        self._shared = shared
+        self._clock = clock
+        self._lock = threading.Lock()
+
+    def accept(self, topic: Topic[Message], payload: bytes) -> None:
+        """One payload; called from the thread of its subscription."""
+        now = self._clock.now_ns()
+        with self._lock:
+            if not self._mailbox.accept(topic, payload, now):
+                get_logger().warning("message refused", reason=self._mailbox.last_refusal)
+                return
+            received = self._mailbox.inputs(now).new(topic)
+            self._mailbox.stepped()
+        for one in received:
+            self._shared.observe(topic.name, one.message)
+
+    def report(self, now: int) -> tuple[dict[str, int], list[str]]:
+        """For health: what was refused, and what is missing."""
+        with self._lock:
+            return dict(self._mailbox.dropped), self._mailbox.missing(now)
+
+
+def run_status(config: Config, stop: threading.Event) -> None:
+    """Serve the status until `stop`. Raises PortTakenError, NoRouterError, AlreadyRunningError, ConfigError."""
+    options = cast(StatusConfig, check_service(config, "status"))
+    clock = MissionClock.of(config.clock)
+    shared = app.SharedStatus(options, config.robot, clock.now_ns)
+    try:
+        server = app.StatusServer(shared)
+    except app.PortTakenError as error:
+        raise PortTakenError(f"{error} in the configuration, or PLGRIM_STATUS__PORT") from error
+    try:
+        with LiveService("status", config, stop) as service:
+            _serve(service, server, StatusFeed(config.robot, shared, clock), stop)
+    finally:
+        server.stop(1.0)
+
+
+def _serve(service: LiveService, server: app.StatusServer, feed: StatusFeed, stop: threading.Event) -> None:
+    outbox = Outbox(service.config.robot, "status", service.epoch)
+    for topic in read_by("status"):
+        service.link.subscribe(topic, feed.accept)
+    service.mailbox_report = feed.report
+    server.start()
+    service.monitor.ready = True
+    get_logger().info("ready", page=f"http://{server.shared.config.host}:{server.port}/")
+    while not stop.wait(_TICK_S):
+        service.monitor.step_began()
+        now = service.clock.now_ns()
+        request = server.shared.graph_request(now)
+        if request is not None:
+            payload = outbox.pack(Output(STATUS_GRAPH_REQUEST, request), now, {})
+            service.link.publish(STATUS_GRAPH_REQUEST, payload)
+        service.monitor.step_ended()

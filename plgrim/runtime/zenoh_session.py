@@ -1,0 +1,247 @@
+"""Zenoh sessions, subscriptions and publications as the services use them.
+
+Services are clients of one router; scouting and gossip are off. Nothing is done in Zenoh's callbacks: every
+subscription is a channel that a thread of its own empties. A thread receives from the *handler*: receiving from the
+subscriber would hold it borrowed, and it could then not be closed. `Session.close` ends the channels, and with them the
+threads; `Link.close` waits for them, since a thread that sits in Zenoh while the interpreter ends aborts the process.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import zenoh
+from zenoh import ext
+
+from plgrim.config import RouterConfig
+from plgrim.errors import NoRouterError
+from plgrim.logs import get_logger
+from schemas.base import Message
+from schemas.contract import SECOND_NS, Topic
+
+_FIFO = 1024
+_KEEP_ALL_CACHE = 64
+_OPEN_TIMEOUT_MS = 2000
+Receive = Callable[[Topic[Message], bytes], None]
+
+
+def session_config(router: RouterConfig, mode: str) -> dict[str, Any]:
+    """Zenoh's configuration. mode: `client` (connects) or `router` (listens)."""
+    place: dict[str, Any] = (
+        {"listen": {"endpoints": [router.endpoint], "exit_on_failure": True}}
+        if mode == "router"
+        else {
+            "connect": {
+                "endpoints": [router.client_endpoint],
+                "timeout_ms": _OPEN_TIMEOUT_MS,
+                "retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2},
+            }
+        }
+    )
+    return place | {
+        "mode": mode,
+        "timestamping": {"enabled": True},
+        "queries_default_timeout": 1000,
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {
+            "shared_memory": {"enabled": router.shared_memory},
+            "unicast": {"open_timeout": 1500, "accept_timeout": 1500},
+            "link": {
+                "tx": {
+                    "lease": router.lease_ms,
+                    "keep_alive": 4,
+                    # Zenoh discards large messages after 1 ms of congestion; with these none was lost on loopback.
+                    "queue": {
+                        "congestion_control": {
+                            "drop": {"wait_before_drop": 50_000, "max_wait_before_drop_fragments": 1_000_000},
+                            "block": {"wait_before_close": 1_000_000},
+                        }
+                    },
+                }
+            },
+        },
+    }
+
+
+def open_session(router: RouterConfig, mode: str, stop: threading.Event, timeout_s: float) -> zenoh.Session:
+    """Open a session; a client waits for its router in short tries, so that signals are served in between.
+
+    Raises NoRouterError after `timeout_s`, or when `stop` is set; zenoh.ZError when a router cannot listen.
+    """
+    zenoh.init_log_from_env_or("error")
+    config = json.dumps(session_config(router, mode))
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            return zenoh.open(zenoh.Config.from_json5(config))
+        except zenoh.ZError as error:
+            if mode == "router":
+                raise
+            if stop.is_set() or time.monotonic() > deadline:
+                raise NoRouterError(
+                    f"no Zenoh router answers at {router.client_endpoint}: start one with `plgrim router`, "
+                    f"or name another with router.endpoint or PLGRIM_ROUTER ({_first_line(error)})"
+                ) from error
+            stop.wait(0.3)
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).split(" at /")[0][:200]
+
+
+def is_latched(topic: Topic[Message]) -> bool:
+    """Whether late joiners get the last message: what comes rarely and does not go stale.
+
+    Not what goes stale (an old plan must not look fresh to a follower that restarts), and not requests and commands
+    (an old stop must not stop a new mission).
+    """
+    return topic.period_ns >= SECOND_NS // 2 and topic.stale_after_ns == 0
+
+
+def _is_advanced(topic: Topic[Message]) -> bool:
+    return topic.keep_all or is_latched(topic)
+
+
+@dataclass(slots=True)
+class Link:
+    """One session with what it publishes, subscribes and answers. Use as a context manager."""
+
+    session: zenoh.Session
+    robot: str
+    _threads: list[threading.Thread] = field(default_factory=list)
+    _keep: list[Any] = field(default_factory=list)
+    _publishers: dict[str, Any] = field(default_factory=dict)
+    _closed: bool = False
+
+    def __enter__(self) -> Link:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Close the session and wait for the threads that empty its channels."""
+        if self._closed:
+            return
+        self._closed = True
+        self.session.close()  # type: ignore[no-untyped-call]
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(timeout_s)
+
+    def publish(self, topic: Topic[Message], payload: bytes) -> None:
+        """Put bytes on a topic; the publisher is declared by the first message or by `declare`."""
+        self.declare(topic).put(payload)
+
+    def declare(self, topic: Topic[Message]) -> Any:
+        """The publisher of a topic. Congestion drops: a blocked reader must never block a writer."""
+        publisher = self._publishers.get(topic.name)
+        if publisher is None:
+            publisher = self._publishers[topic.name] = self._declare(topic)
+        return publisher
+
+    def _declare(self, topic: Topic[Message]) -> Any:
+        key = topic.key(self.robot)
+        qos: dict[str, Any] = {
+            "congestion_control": zenoh.CongestionControl.DROP,
+            "priority": _priority(topic),
+            "express": topic.max_bytes <= 256 * 1024,
+            "encoding": f"application/msgpack;plgrim/{topic.message.schema_name}.v{topic.message.schema_version}",
+        }
+        if not _is_advanced(topic):
+            return self.session.declare_publisher(key, **qos)
+        return ext.declare_advanced_publisher(
+            self.session,
+            key,
+            cache=ext.CacheConfig(max_samples=_KEEP_ALL_CACHE if topic.keep_all else 1),
+            publisher_detection=True,
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+            **qos,
+        )
+
+    def subscribe(self, topic: Topic[Message], receive: Receive, every: bool = False) -> None:
+        """Have a thread of its own call `receive` with each payload of a topic.
+
+        Latest-only topics come through a ring of one: what was not fetched is replaced, never queued. every: queue
+        them all the same (for recorders). Exceptions in `receive` are logged and do not end the thread.
+        """
+        channel: Any = (
+            zenoh.handlers.FifoChannel(_FIFO) if topic.keep_all or every else zenoh.handlers.RingChannel(1)
+        )
+        subscriber = self._subscriber(topic, channel)
+        self._keep.append(subscriber)
+        self._spawn(f"sub {topic.name}", subscriber.handler, lambda s: receive(topic, s.payload.to_bytes()))
+
+    def _subscriber(self, topic: Topic[Message], channel: Any) -> Any:
+        key = topic.key(self.robot)
+        if not _is_advanced(topic):
+            return self.session.declare_subscriber(key, channel)
+        history: dict[str, Any] = {}
+        if topic.period_ns > 0:
+            samples = _KEEP_ALL_CACHE if topic.keep_all else 1
+            history["history"] = ext.HistoryConfig(detect_late_publishers=True, max_samples=samples)
+        return ext.declare_advanced_subscriber(
+            self.session,
+            key,
+            channel,
+            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            **history,
+        )
+
+    def answer(self, key: str, reply: Callable[[], bytes]) -> None:
+        """Answer every query on a key with `reply()`, from a thread of its own."""
+        queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(16))
+        self._keep.append(queryable)
+        self._spawn(f"query {key}", queryable.handler, lambda q: q.reply(q.key_expr, reply()))
+
+    def ask(self, key: str, timeout_s: float) -> bytes | None:
+        """The first good answer to a query, or None: nobody there, refused, or no answer in time."""
+        for reply in self.session.get(key, timeout=timeout_s):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes()
+        return None
+
+    def token(self, key: str) -> None:
+        """Declare a liveliness token that lives as long as this session."""
+        self._keep.append(self.session.liveliness().declare_token(key))
+
+    def tokens(self, expression: str, timeout_s: float = 1.0) -> list[str]:
+        """The keys of the living tokens that match."""
+        replies = self.session.liveliness().get(expression, timeout=timeout_s)
+        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+
+    def _spawn(self, name: str, handler: Any, work: Callable[[Any], None]) -> None:
+        thread = threading.Thread(target=_drain, args=(handler, work, name), name=name, daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+
+def _drain(handler: Any, work: Callable[[Any], None], name: str) -> None:
+    while True:
+        try:
+            item = handler.recv()
+        except zenoh.ZError:  # the channel is closed: the session has ended
+            return
+        try:
+            work(item)
+        except Exception as error:
+            get_logger().error("receiving failed", of=name, error=repr(error))
+        del item  # a query is finished when it is dropped
+
+
+def _priority(topic: Topic[Message]) -> zenoh.Priority:
+    if topic.max_bytes > 1024 * 1024:
+        return zenoh.Priority.DATA_LOW
+    if topic.name in ("reconciler/plan", "status/command", "mission/state"):
+        return zenoh.Priority.INTERACTIVE_HIGH
+    return zenoh.Priority.DATA
+
+
+def connect(router: RouterConfig, robot: str, stop: threading.Event, timeout_s: float) -> Link:
+    """A client session as a Link. Raises NoRouterError."""
+    return Link(open_session(router, "client", stop, timeout_s), robot)

@@ -1,0 +1,35 @@
+"""Parameters of the global coverage planner."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from planning.reward import RewardWeights
+
+
+class Config(BaseModel):
+    """What the QMDP weighs and how firmly it keeps its target. Unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    period_s: float = Field(1.0, gt=0, le=60, description="Time between steps without a new graph, s.")
+    latency_s: float = Field(0.05, ge=0, le=10, description="Lock-step: time that a step takes, s.")
+    reward: RewardWeights = RewardWeights()
+    particles: int = Field(32, ge=1, le=4096, description="Samples of the robot's pose: the belief b(q).")
+    switch_margin_relative: float = Field(
+        0.3, ge=0, le=10, description="The target is left for one whose Q is better by this share of |Q|, and"
+    )
+    switch_margin: float = Field(
+        1.0, ge=0, le=1000, description="better by this much too, nats: more keeps the target longer."
+    )
+    same_target_m: float = Field(
+        2.0, gt=0, le=20, description="A frontier so near to the target's place is the same target, m."
+    )
+    local_range_m: float = Field(
+        18.0,
+        ge=0,
+        le=200,
+        description="Frontiers so near are the local planner's: not in the value to go, m.",
+    )
+    alternatives: int = Field(5, ge=1, le=50, description="Frontiers weighed exactly and reported.")
+    ask_again_s: float = Field(2.0, gt=0, le=60, description="Time between requests for the whole graph, s.")

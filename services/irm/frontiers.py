@@ -1,0 +1,327 @@
+"""FrontierManager: the border of covered and uncovered traversable ground (Algorithm 1; Keidar and Kaminka 2012).
+
+Incremental: only what lies in the window around the robot is looked at again; frontiers outside keep what they had,
+as no cell there can have changed.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.clusters import label_components
+from planning.coverage import LOG_2
+from planning.grid import UNKNOWN
+from planning.kernels import njit
+from services.irm.config import Config
+from services.irm.window import Window
+
+
+@dataclass(slots=True)
+class Frontier:
+    """A frontier node. x_m, y_m: a place that the robot's centre can reach. gain: nats of whole patches."""
+
+    node_id: int
+    x_m: float
+    y_m: float
+    gain: float
+    beside_s: float = 0.0
+    best_gain: float = math.inf
+    seen: bool = True
+
+
+@dataclass(slots=True)
+class GivenUp:
+    """A frontier that was given up, why, and when it may come back."""
+
+    x_m: float
+    y_m: float
+    gain: float
+    reason: str
+    until_ns: int
+
+
+@dataclass(slots=True)
+class FrontierManager:
+    """Finds, names, prunes and gives up frontiers."""
+
+    config: Config
+    frontiers: dict[int, Frontier] = field(default_factory=dict)
+    given_up: list[GivenUp] = field(default_factory=list)
+
+    def update(
+        self, window: Window, robot: tuple[float, float], now_ns: int, elapsed_s: float, next_id: int
+    ) -> int:
+        """Look at the window again. elapsed_s: since the last call. Returns the next free node id."""
+        self.given_up = [g for g in self.given_up if g.until_ns > now_ns]
+        found = [f for f in find_frontiers(window, self.config) if not self._is_given_up(f[0], f[1])]
+        inside = [f for f in self.frontiers.values() if _in_window(window, f)]
+        for frontier in inside:
+            frontier.seen = False
+        taken: set[int] = set()
+        for distance, index, node_id in self._pairs(found, inside):
+            if index in taken or self.frontiers[node_id].seen or distance > self.config.frontier_same_m:
+                continue
+            taken.add(index)
+            frontier = self.frontiers[node_id]
+            frontier.x_m, frontier.y_m, frontier.gain = found[index]
+            frontier.seen = True
+        for frontier in inside:
+            if not frontier.seen:
+                del self.frontiers[frontier.node_id]
+        for index, (x, y, gain) in enumerate(found):
+            if index not in taken:
+                self.frontiers[next_id] = Frontier(next_id, x, y, gain)
+                next_id += 1
+        self._watch(robot, now_ns, elapsed_s)
+        return next_id
+
+    @staticmethod
+    def _pairs(found: list[tuple[float, float, float]], old: list[Frontier]) -> list[tuple[float, int, int]]:
+        pairs = [
+            (math.hypot(x - f.x_m, y - f.y_m), i, f.node_id) for i, (x, y, _) in enumerate(found) for f in old
+        ]
+        return sorted(pairs)
+
+    def _is_given_up(self, x_m: float, y_m: float) -> bool:
+        near = 0.7 * self.config.give_up_radius_m
+        return any(math.hypot(g.x_m - x_m, g.y_m - y_m) < near for g in self.given_up)
+
+    def _watch(self, robot: tuple[float, float], now_ns: int, elapsed_s: float) -> None:
+        """Give up frontiers beside which the robot has been for long and that yield nothing."""
+        for node_id in sorted(self.frontiers):
+            f = self.frontiers[node_id]
+            if f.gain < 0.9 * f.best_gain:
+                f.best_gain, f.beside_s = f.gain, 0.0
+            if math.hypot(f.x_m - robot[0], f.y_m - robot[1]) <= self.config.give_up_radius_m:
+                f.beside_s += elapsed_s
+            if f.beside_s > self.config.give_up_s:
+                self.give_up(f, "stood beside it and saw nothing new", now_ns)
+
+    def give_up(self, frontier: Frontier, reason: str, now_ns: int) -> None:
+        """Take a frontier off the list for a while."""
+        until = now_ns + int(self.config.retry_after_s * 1e9)
+        self.given_up.append(GivenUp(frontier.x_m, frontier.y_m, frontier.gain, reason, until))
+        self.frontiers.pop(frontier.node_id, None)
+
+    def state(self) -> dict[str, Any]:
+        """For a snapshot."""
+        return {
+            "frontiers": [
+                [f.node_id, f.x_m, f.y_m, f.gain, f.beside_s, f.best_gain]
+                for _, f in sorted(self.frontiers.items())
+            ],
+            "given_up": [[g.x_m, g.y_m, g.gain, g.reason, g.until_ns] for g in self.given_up],
+        }
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """From a snapshot."""
+        self.frontiers = {int(f[0]): Frontier(int(f[0]), *f[1:]) for f in state["frontiers"]}
+        self.given_up = [GivenUp(*g) for g in state["given_up"]]
+
+
+def _in_window(window: Window, frontier: Frontier) -> bool:
+    row, column = window.spec.cell_of(frontier.x_m, frontier.y_m)
+    return window.spec.contains(row, column)
+
+
+def find_frontiers(window: Window, config: Config) -> list[tuple[float, float, float]]:
+    """The frontiers of a window: (x, y, expected information gain), in a fixed order.
+
+    The uncovered ground is split into connected pieces; the border of a piece with covered ground is cut into blocks
+    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach.
+    """
+    s = window.spec
+    labels = np.zeros(s.shape, np.int32)
+    pieces = label_components(window.uncovered, labels)
+    if pieces == 0:
+        return []
+    block = np.full(s.shape, -1, np.int32)
+    cells = max(1, round(config.frontier_block_m / s.resolution_m))
+    covered = window.ground & ~window.uncovered
+    blocks = mark_borders(window.uncovered, covered, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block)
+    if blocks == 0:
+        return []
+    reach = round(config.frontier_reach_m / s.resolution_m)
+    spread_blocks(window.uncovered, block, reach, blocks)
+    gain, sums = np.zeros(blocks), np.zeros((blocks, 4))
+    unknown_gain = config.unknown_depth_m * s.resolution_m * LOG_2 / config.spacing_m**2
+    block_gains(window.entropy, window.state == UNKNOWN, block, unknown_gain, gain, sums)
+    places = block_places(window.free_space, block, sums, round(1.0 / s.resolution_m))
+    piece_of = np.zeros(blocks, np.int64)
+    inside = block >= 0
+    piece_of[block[inside]] = labels[inside]
+    return _select(gain, places, piece_of, window, config)
+
+
+def _select(
+    gain: NDArray[np.float64],
+    places: NDArray[np.int64],
+    piece_of: NDArray[np.int64],
+    window: Window,
+    config: Config,
+) -> list[tuple[float, float, float]]:
+    """Blocks with enough gain; of a piece of many small blocks that is worth it as a whole, its best block."""
+    found = []
+    total = np.bincount(piece_of, weights=gain, minlength=int(piece_of.max()) + 1)
+    best: dict[int, int] = {}
+    for index in range(len(gain)):
+        piece = int(piece_of[index])
+        if piece not in best or gain[index] > gain[best[piece]]:
+            best[piece] = index
+    for index in range(len(gain)):
+        piece = int(piece_of[index])
+        alone = gain[index] >= config.frontier_min_gain
+        together = best[piece] == index and total[piece] >= config.frontier_min_gain
+        if places[index, 0] >= 0 and (alone or together):
+            x, y = window.spec.centre_of(int(places[index, 0]), int(places[index, 1]))
+            found.append((x, y, float(gain[index] if alone else total[piece])))
+    return found
+
+
+@njit
+def mark_borders(
+    uncovered: NDArray[np.bool_],
+    covered: NDArray[np.bool_],
+    labels: NDArray[np.int32],
+    ix0: int,
+    iy0: int,
+    cells: int,
+    pieces: int,
+    robot: tuple[int, int],
+    block: NDArray[np.int32],
+) -> int:
+    """Number the border cells by (piece, snapped block); a piece without a border gets its cell nearest the robot.
+
+    labels: (h, w), 0 outside, 1..pieces. block: out, -1 elsewhere. Returns how many blocks there are.
+    """
+    height, width = uncovered.shape
+    bx0, by0 = ix0 // cells, iy0 // cells
+    across = (ix0 + width) // cells - bx0 + 1
+    down = (iy0 + height) // cells - by0 + 1
+    number = np.full((pieces + 1) * across * down, -1, np.int32)
+    has_border = np.zeros(pieces + 1, np.bool_)
+    nearest = np.full(pieces + 1, -1, np.int64)
+    nearest_distance = np.full(pieces + 1, np.inf)
+    blocks = 0
+    for row in range(height):
+        for column in range(width):
+            if not uncovered[row, column]:
+                continue
+            piece = labels[row, column]
+            distance = float((row - robot[0]) ** 2 + (column - robot[1]) ** 2)
+            if distance < nearest_distance[piece]:
+                nearest_distance[piece], nearest[piece] = distance, row * width + column
+            border = False
+            for r in range(max(0, row - 1), min(height, row + 2)):
+                for c in range(max(0, column - 1), min(width, column + 2)):
+                    border = border or covered[r, c]
+            if not border:
+                continue
+            has_border[piece] = True
+            key = (piece * down + (iy0 + row) // cells - by0) * across + (ix0 + column) // cells - bx0
+            if number[key] < 0:
+                number[key] = blocks
+                blocks += 1
+            block[row, column] = number[key]
+    for piece in range(1, pieces + 1):
+        if not has_border[piece] and nearest[piece] >= 0:
+            block[nearest[piece] // width, nearest[piece] % width] = blocks
+            blocks += 1
+    return blocks
+
+
+@njit
+def spread_blocks(uncovered: NDArray[np.bool_], block: NDArray[np.int32], reach: int, blocks: int) -> None:
+    """Breadth-first: each uncovered cell takes the number of the block that gets to it first, within `reach` steps.
+
+    block: (h, w), changed in place; cells that the border gave keep their number.
+    """
+    height, width = uncovered.shape
+    queue = np.empty(height * width, np.int64)
+    depth = np.zeros((height, width), np.int32)
+    head, tail = 0, 0
+    for row in range(height):
+        for column in range(width):
+            if block[row, column] >= 0:
+                queue[tail] = row * width + column
+                tail += 1
+    while head < tail:
+        row, column = queue[head] // width, queue[head] % width
+        head += 1
+        if depth[row, column] >= reach:
+            continue
+        for r in range(max(0, row - 1), min(height, row + 2)):
+            for c in range(max(0, column - 1), min(width, column + 2)):
+                if uncovered[r, c] and block[r, c] < 0:
+                    block[r, c] = block[row, column]
+                    depth[r, c] = depth[row, column] + 1
+                    queue[tail] = r * width + c
+                    tail += 1
+
+
+@njit
+def block_gains(
+    entropy: NDArray[np.float32],
+    unknown: NDArray[np.bool_],
+    block: NDArray[np.int32],
+    unknown_gain: float,
+    gain: NDArray[np.float64],
+    sums: NDArray[np.float64],
+) -> None:
+    """Expected information gain of each block: entropy of its cells, and of the unknown that they border on.
+
+    sums: (blocks, 4): number of cells, sum of rows, sum of columns, unused.
+    """
+    height, width = block.shape
+    for row in range(height):
+        for column in range(width):
+            b = block[row, column]
+            if b < 0:
+                continue
+            gain[b] += entropy[row, column]
+            sums[b, 0] += 1.0
+            sums[b, 1] += row
+            sums[b, 2] += column
+            near_unknown = (
+                (row > 0 and unknown[row - 1, column])
+                or (row < height - 1 and unknown[row + 1, column])
+                or (column > 0 and unknown[row, column - 1])
+                or (column < width - 1 and unknown[row, column + 1])
+            )
+            if near_unknown:
+                gain[b] += unknown_gain
+
+
+@njit
+def block_places(
+    free_space: NDArray[np.bool_], block: NDArray[np.int32], sums: NDArray[np.float64], reach: int
+) -> NDArray[np.int64]:
+    """For each block the free-space cell that is nearest to its middle and near to one of its cells; -1 if none.
+
+    reach: a free-space cell within so many cells (Chebyshev) of a cell of the block counts.
+    """
+    height, width = block.shape
+    places = np.full((sums.shape[0], 2), -1, np.int64)
+    best = np.full(sums.shape[0], np.inf)
+    for row in range(height):
+        for column in range(width):
+            b = block[row, column]
+            if b < 0:
+                continue
+            mid_row, mid_column = sums[b, 1] / sums[b, 0], sums[b, 2] / sums[b, 0]
+            near = 0 if free_space[row, column] else reach
+            for r in range(max(0, row - near), min(height, row + near + 1)):
+                for c in range(max(0, column - near), min(width, column + near + 1)):
+                    if not free_space[r, c]:
+                        continue
+                    off = (r - row) ** 2 + (c - column) ** 2
+                    score = (r - mid_row) ** 2 + (c - mid_column) ** 2 + 4.0 * off
+                    if score < best[b]:
+                        best[b] = score
+                        places[b, 0], places[b, 1] = r, c
+    return places

@@ -1,0 +1,228 @@
+"""The irm stage: risk map, pose graph and coverage scans in; Local IRM and Global IRM out (Algorithm 1)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from planning.frames import Planar
+from planning.grid import GridSpec
+from schemas.base import Pose
+from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
+from schemas.sensing import CoverageScan, Odometry
+from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.topics import (
+    COVERAGE,
+    COVERAGE_SCAN,
+    COVERAGE_WINDOW,
+    FOLLOWER,
+    GCP_GRAPH_REQUEST,
+    GLOBAL_IRM,
+    LOCAL_IRM,
+    MISSION_GRAPH_REQUEST,
+    ODOMETRY,
+    POSE_GRAPH,
+    RISK_MAP,
+    STATUS_GRAPH_REQUEST,
+)
+from schemas.world import CoverageSummary, CoverageWindow, GridHeader, RiskMap
+from services.irm.config import Config
+from services.irm.footprints import FootprintStore
+from services.irm.local_irm import LocalIrmBuilder
+from services.irm.roadmap import Roadmap
+from services.irm.tiles import TileLayer
+from services.irm.window import Window, build_window, window_picture
+
+__all__ = ["Config", "IrmStage", "create", "spec"]
+
+_MAX_PENDING = 50
+
+
+def spec(config: Config) -> StageSpec:
+    """How to run the stage: at the period of the Local IRM."""
+    return StageSpec("irm", int(config.local_period_s * SECOND_NS), latency_ns=SECOND_NS // 10)
+
+
+def create(config: Config, setup: StageSetup) -> Stage:
+    """An irm stage."""
+    return IrmStage(config)
+
+
+def planar(pose: Pose) -> Planar:
+    """A pose in the plane."""
+    return Planar(pose.x_m, pose.y_m, pose.yaw_rad)
+
+
+class IrmStage:
+    """Keeps the hierarchical belief."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._ground: TileLayer | None = None
+        self._coverage: TileLayer | None = None
+        self._store: FootprintStore | None = None
+        self._local: LocalIrmBuilder | None = None
+        self._roadmap = Roadmap(config)
+        self._keyframes: dict[int, Planar] = {}
+        self._pending: list[CoverageScan] = []
+        self._penalties: list[tuple[int, float, float]] = []
+        self._global_ns = -(10**18)
+        self._reachable_cells = 0
+        self._covered_cells = 0
+        self._entropy_left = 0.0
+
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+        """One round of Algorithm 1; nothing while the risk map or the pose is missing or stale."""
+        self._pending += [r.message for r in inputs.new(COVERAGE_SCAN)]
+        self._pending = self._pending[-_MAX_PENDING:]
+        risk, odometry = inputs.current(RISK_MAP), inputs.current(ODOMETRY)
+        if risk is None or odometry is None:
+            return []
+        self._allocate(risk)
+        self._read_pose_graph(inputs)
+        self._read_follower(now, inputs, odometry)
+        self._add_scans(risk, odometry)
+        window = self._window(risk, odometry, now)
+        assert self._local is not None
+        local = self._local.build(window, odometry.pose, odometry.map_to_odom, risk.stamp_ns)
+        found: Outputs = [Output(LOCAL_IRM, local)]
+        asked = [
+            r for t in (GCP_GRAPH_REQUEST, MISSION_GRAPH_REQUEST, STATUS_GRAPH_REQUEST) for r in inputs.new(t)
+        ]
+        due = now - self._global_ns >= self._config.global_period_s * SECOND_NS - SECOND_NS // 100
+        if due or asked:
+            found += self._global(now, window, odometry, bool(asked))
+        return found
+
+    def _allocate(self, risk: RiskMap) -> None:
+        if self._ground is None:
+            self._ground = TileLayer("uint8", 0, risk.grid.resolution_m)
+            self._coverage = TileLayer("float32", 0.0, risk.grid.resolution_m)
+            self._store = FootprintStore(self._coverage)
+            self._local = LocalIrmBuilder(self._config, risk.footprint_radius_m)
+
+    def _read_pose_graph(self, inputs: Inputs) -> None:
+        received = inputs.latest(POSE_GRAPH)
+        if received is None or not received.fresh:
+            return
+        graph = received.message
+        self._keyframes = {
+            int(k): Planar(float(p[0]), float(p[1]), float(p[3]))
+            for k, p in zip(graph.keyframe_id, graph.pose_in_map, strict=True)
+        }
+        assert self._store is not None
+        self._store.follow(self._keyframes)
+
+    def _read_follower(self, now: Stamp, inputs: Inputs, odometry: Odometry) -> None:
+        """Where the robot was blocked or stuck, the ground ahead is riskier than it looks."""
+        memory = int(self._config.blocked_memory_s * SECOND_NS)
+        self._penalties = [p for p in self._penalties if now - p[0] < memory]
+        follower = inputs.current(FOLLOWER)
+        if follower is None or not (follower.blocked or follower.stuck):
+            return
+        ahead = planar(odometry.map_to_odom).compose(planar(odometry.pose)).apply(0.5, 0.0)
+        if all(math.dist(ahead, p[1:]) > 0.3 for p in self._penalties):
+            self._penalties.append((now, *ahead))
+
+    def _add_scans(self, risk: RiskMap, odometry: Odometry) -> None:
+        assert self._store is not None
+        g = risk.grid
+        grid = GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
+        waiting = []
+        for scan in self._pending:
+            keyframe = self._keyframes.get(scan.keyframe_id)
+            if keyframe is None:
+                waiting.append(scan)
+                continue
+            self._store.add(scan, keyframe, risk.state, grid, planar(odometry.map_to_odom))
+        self._pending = waiting
+
+    def _window(self, risk: RiskMap, odometry: Odometry, now: Stamp) -> Window:
+        assert self._ground is not None and self._coverage is not None
+        return build_window(
+            risk, odometry.pose.x_m, odometry.pose.y_m, self._config, self._ground, self._coverage,
+            [(x, y) for _, x, y in self._penalties],
+        )  # fmt: skip
+
+    def _global(self, now: Stamp, window: Window, odometry: Odometry, whole: bool) -> Outputs:
+        elapsed = min((now - self._global_ns) / SECOND_NS, 10.0)
+        self._global_ns = now
+        place = planar(odometry.map_to_odom).compose(planar(odometry.pose))
+        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed)
+        first = self._roadmap.version == 0
+        message = self._roadmap.message(odometry.pose, odometry.map_to_odom, now, whole or first)
+        s = window.spec
+        header = GridHeader(resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, width=s.width, height=s.height)
+        return [
+            Output(GLOBAL_IRM, message),
+            Output(COVERAGE, self._summary(now)),
+            Output(COVERAGE_WINDOW, CoverageWindow(stamp_ns=now, grid=header, cell=window_picture(window))),
+        ]
+
+    def _summary(self, now: Stamp) -> CoverageSummary:
+        reachable, covered = self._areas()
+        given_up = self._roadmap.manager.given_up
+        frontiers = self._roadmap.manager.frontiers
+        return CoverageSummary(
+            stamp_ns=now,
+            irm_version=max(self._roadmap.version, 1),
+            reachable_area_m2=reachable,
+            covered_area_m2=covered,
+            covered_fraction=covered / reachable if reachable else 0.0,
+            entropy_left=float(sum(f.gain for f in frontiers.values())),
+            frontiers=len(frontiers),
+            frontier_gain=float(sum(f.gain for f in frontiers.values())),
+            breadcrumbs=self._roadmap.breadcrumbs(),
+            settled=not frontiers and reachable > 0.0,
+            unreachable_xy_m=np.array([(g.x_m, g.y_m) for g in given_up], dtype=np.float64).reshape(-1, 2),
+            unreachable_gain=np.array([g.gain for g in given_up], dtype=np.float64),
+            unreachable_reason=[g.reason for g in given_up],
+        )
+
+    def _areas(self) -> tuple[float, float]:
+        """(reachable, covered) ground in m2, over everything seen so far."""
+        assert self._ground is not None and self._coverage is not None
+        p = self._config.covered_probability
+        bound = math.log(p / (1.0 - p))
+        reachable, covered = 0, 0
+        looked = dict(self._coverage.tiles())
+        for key, ground in self._ground.tiles():
+            mask = ground == 1
+            reachable += int(mask.sum())
+            if key in looked:
+                covered += int((mask & (looked[key] >= bound)).sum())
+        area = self._ground.resolution_m**2
+        return reachable * area, covered * area
+
+    def snapshot(self) -> bytes:
+        """The whole belief."""
+        state = {
+            "roadmap": self._roadmap.state(),
+            "keyframes": [[k, *p] for k, p in sorted(self._keyframes.items())],
+            "penalties": self._penalties,
+            "global_ns": self._global_ns,
+            "resolution": self._ground.resolution_m if self._ground else 0.0,
+            "radius": self._local.footprint_radius_m if self._local else 0.0,
+            "version": self._local.version if self._local else 0,
+            "ground": self._ground.state() if self._ground else {},
+            "coverage": self._coverage.state() if self._coverage else {},
+            "footprints": self._store.state() if self._store else {},
+        }
+        return pack_snapshot(state)
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot."""
+        state = unpack_snapshot(snapshot)
+        self._roadmap.set_state(state["roadmap"])
+        self._keyframes = {int(k): Planar(x, y, yaw) for k, x, y, yaw in state["keyframes"]}
+        self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
+        self._global_ns = state["global_ns"]
+        if state["resolution"]:
+            self._ground = TileLayer("uint8", 0, state["resolution"])
+            self._ground.set_state(state["ground"])
+            self._coverage = TileLayer("float32", 0.0, state["resolution"])
+            self._coverage.set_state(state["coverage"])
+            self._store = FootprintStore(self._coverage)
+            self._store.set_state(state["footprints"])
+            self._local = LocalIrmBuilder(self._config, state["radius"], state["version"])

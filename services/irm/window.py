@@ -1,0 +1,164 @@
+"""The fine layers around the robot that both roadmaps are built from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.clusters import flood_fill
+from planning.coverage import entropy, probability
+from planning.footprint import footprint_hazard
+from planning.grid import FREE, LETHAL, UNKNOWN, GridSpec
+from planning.kernels import njit
+from schemas.world import RiskMap
+from services.irm.config import Config
+from services.irm.tiles import TileLayer
+
+
+@dataclass(slots=True)
+class Window:
+    """What is known around the robot, all (h, w) over `spec` in `map`.
+
+    passable: the robot's centre fits. free_space: passable and connected to the robot. ground: what its body can
+    touch from there. uncovered: ground below the covered probability. entropy: of ground cells, nats of whole
+    patches (0 elsewhere). hazard: mean hazard rate under the body, 1/m. step_cost: cost per metre of the grid search.
+    """
+
+    spec: GridSpec
+    state: NDArray[np.uint8]
+    clearance_m: NDArray[np.float32]
+    hazard: NDArray[np.float32]
+    step_cost: NDArray[np.float32]
+    free_space: NDArray[np.bool_]
+    ground: NDArray[np.bool_]
+    uncovered: NDArray[np.bool_]
+    probability: NDArray[np.float32]
+    entropy: NDArray[np.float32]
+    robot_cell: tuple[int, int]
+
+
+def build_window(
+    risk: RiskMap,
+    x_m: float,
+    y_m: float,
+    config: Config,
+    ground_layer: TileLayer,
+    coverage_layer: TileLayer,
+    penalties: list[tuple[float, float]],
+) -> Window:
+    """The layers around the robot from a risk map and what was known before; updates the ground layer.
+
+    penalties: places (x, y) where the robot was blocked lately; their hazard is raised.
+    """
+    g = risk.grid
+    spec = GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
+    before = ground_layer.read(spec) == 1
+    hazard = footprint_hazard(
+        risk.hazard_cvar, risk.footprint_radius_m + config.hazard_margin_m, g.resolution_m
+    )
+    for px, py in penalties:
+        _raise_hazard(hazard, spec, px, py)
+    needed = risk.footprint_radius_m + config.clearance_margin_m
+    relaxed = needed - config.clearance_hysteresis_m
+    passable = (risk.state == FREE) & (
+        (risk.clearance_m >= needed) | (before & (risk.clearance_m >= relaxed))
+    )
+    robot = spec.cell_of(x_m, y_m)
+    free_space = connected_free_space(passable, robot)
+    ground = np.zeros(spec.shape, dtype=np.bool_)
+    dilate_disc(free_space, risk.footprint_radius_m / g.resolution_m, ground)
+    ground &= risk.state == FREE
+    ground |= before & (risk.state == UNKNOWN)
+    ground_layer.write(spec, np.where(ground, 1, 0).astype(np.uint8))
+    p = probability(coverage_layer.read(spec))
+    cell_share = (g.resolution_m / config.spacing_m) ** 2
+    cell_entropy = np.where(ground, entropy(p) * np.float32(cell_share), np.float32(0.0))
+    return Window(
+        spec=spec,
+        state=risk.state,
+        clearance_m=risk.clearance_m,
+        hazard=hazard,
+        step_cost=_step_cost(hazard, risk.clearance_m, needed, config.comfort_clearance_m),
+        free_space=free_space,
+        ground=ground,
+        uncovered=ground & (p < config.covered_probability),
+        probability=p,
+        entropy=cell_entropy,
+        robot_cell=robot,
+    )
+
+
+def _step_cost(
+    hazard: NDArray[np.float32], clearance_m: NDArray[np.float32], needed_m: float, comfort_m: float
+) -> NDArray[np.float32]:
+    """Cost per metre: 1, more where hazard is felt and within the comfort clearance (keeps paths off walls)."""
+    span = max(comfort_m - needed_m, 1e-3)
+    tight = np.clip((comfort_m - clearance_m) / span, 0.0, 1.0)
+    cost: NDArray[np.float32] = (1.0 + 2.0 * hazard + 1.5 * tight**2).astype(np.float32)
+    return cost
+
+
+def _raise_hazard(hazard: NDArray[np.float32], spec: GridSpec, x_m: float, y_m: float) -> None:
+    reach = math.ceil(0.4 / spec.resolution_m)
+    row, column = spec.cell_of(x_m, y_m)
+    r0, r1 = max(0, row - reach), min(spec.height, row + reach + 1)
+    c0, c1 = max(0, column - reach), min(spec.width, column + reach + 1)
+    if r0 < r1 and c0 < c1:
+        hazard[r0:r1, c0:c1] += np.float32(1.0)
+
+
+def connected_free_space(passable: NDArray[np.bool_], robot: tuple[int, int]) -> NDArray[np.bool_]:
+    """Cells that the robot's centre can reach. A robot whose own cell is too tight starts at the nearest good one."""
+    reached = np.zeros(passable.shape, dtype=np.bool_)
+    height, width = passable.shape
+    row, column = robot
+    for reach in range(7):
+        r0, c0 = max(0, row - reach), max(0, column - reach)
+        piece = passable[r0 : min(height, row + reach + 1), c0 : min(width, column + reach + 1)]
+        found = np.argwhere(piece)
+        if len(found):
+            offsets = found + np.array([r0 - row, c0 - column])
+            nearest = found[int(np.argmin((offsets**2).sum(axis=1)))] + np.array([r0, c0])
+            flood_fill(passable, nearest[None, :].astype(np.int32), reached)
+            if int(reached.sum()) > 4:
+                break
+    return reached
+
+
+@njit
+def dilate_disc(source: NDArray[np.bool_], radius_cells: float, out: NDArray[np.bool_]) -> None:
+    """Cells whose centre is within the radius of a source cell's centre. Only border cells are stamped."""
+    height, width = source.shape
+    reach = int(math.floor(radius_cells + 1e-9))
+    for row in range(height):
+        for column in range(width):
+            if not source[row, column]:
+                continue
+            out[row, column] = True
+            inner = (
+                0 < row < height - 1
+                and 0 < column < width - 1
+                and source[row - 1, column]
+                and source[row + 1, column]
+                and source[row, column - 1]
+                and source[row, column + 1]
+            )
+            if inner:
+                continue
+            for r in range(max(0, row - reach), min(height, row + reach + 1)):
+                for c in range(max(0, column - reach), min(width, column + reach + 1)):
+                    if (r - row) ** 2 + (c - column) ** 2 <= radius_cells * radius_cells + 1e-9:
+                        out[r, c] = True
+
+
+def window_picture(window: Window) -> NDArray[np.uint8]:
+    """The cells of a `CoverageWindow`: 0 unknown, 1 uncovered ground, 2 covered, 3 obstacle, 4 out of reach."""
+    cell = np.zeros(window.spec.shape, dtype=np.uint8)
+    cell[window.state == FREE] = 4
+    cell[window.state == LETHAL] = 3
+    cell[window.ground] = 2
+    cell[window.uncovered] = 1
+    return cell

@@ -1,0 +1,26 @@
+"""Parameters of the local coverage planner. The paper gives none; every number is a starting choice."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from planning.reward import RewardWeights
+
+
+class Config(BaseModel):
+    """Configuration of lcp; unknown keys are refused at every level."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    weights: RewardWeights = RewardWeights()
+    max_depth: int = Field(24, ge=1, le=200, description="Horizon of the tree, actions.")
+    max_nodes: int = Field(40_000, ge=100, le=5_000_000, description="Histories that the tree can hold.")
+    exploration: float = Field(0.1, ge=0, le=10, description="UCB constant, in units of the range of returns.")
+    rollout_steps: int = Field(24, ge=0, le=500, description="Moves of the informed rollout after the tree.")
+    rollout_random: float = Field(0.1, ge=0, le=1, description="Share of random moves in rollouts.")
+    path_steps: int = Field(24, ge=1, le=500, description="Moves of the path that is given to the reconciler.")
+    min_visits: int = Field(12, ge=1, le=100_000, description="Tree nodes with fewer visits are not policy.")
+    cover_begin_entropy: float = Field(0.7, ge=0, le=100, description="So much in reach starts covering, nats.")
+    cover_end_entropy: float = Field(0.1, ge=0, le=100, description="Less in reach ends covering, nats.")
+    cover_radius_m: float = Field(14.0, ge=1, le=60, description="Ground up to here counts as in reach, m of travel.")
+    seconds_per_deadline: float = Field(0.3, ge=0.01, le=10, description="Live planning time of an episode, s.")

@@ -1,0 +1,271 @@
+"""The lcp stage: answers planning episodes with a local policy (paper, Local Coverage Planner)."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+
+from planning.coverage_model import ACTIONS, BITS, search_coverage
+from planning.lattice_graph import travel_costs
+from planning.pomcp import PolicyTree, Pomcp
+from planning.randomness import stream
+from planning.reward import parameters
+from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
+from schemas.operation import MissionPhase
+from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
+from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
+from schemas.world import LocalIrm
+from services.lcp.config import Config
+from services.lcp.policy_path import likely_moves, line_of, moves_to
+from services.lcp.problem import (
+    Junction,
+    coverage_model,
+    junction_of,
+    leaf_values,
+    local_entropy,
+    node_at,
+    planar,
+)
+
+__all__ = ["Config", "LcpStage", "create", "spec"]
+
+_KEPT_IRMS = 8
+_MAX_RISK = 0.9
+_EMPTY_TREE = PolicyTree(
+    np.array([-1], np.int32), np.zeros(1), np.zeros(1, np.int32), np.zeros(1, np.int32), np.zeros(1, np.int32),
+    np.zeros(2, np.int32), np.zeros(0, np.int32), np.zeros(0, np.int32),
+)  # fmt: skip
+
+
+def spec(config: Config) -> StageSpec:
+    """How to run the stage: on every episode request."""
+    return StageSpec("lcp", SECOND_NS // 5, (EPISODE.name,), latency_ns=SECOND_NS // 4)
+
+
+def create(config: Config, setup: StageSetup) -> Stage:
+    """An lcp stage."""
+    return LcpStage(config, setup)
+
+
+class LcpStage:
+    """Keeps the last few Local IRMs, so that a request is answered on the version that it names."""
+
+    def __init__(self, config: Config, setup: StageSetup) -> None:
+        self._config = config
+        self._seed = setup.seed
+        self._stopwatch = setup.stopwatch
+        self._irms: OrderedDict[int, LocalIrm] = OrderedDict()
+        self._covering = True
+        self._answered = 0
+        self._solver = Pomcp(
+            state_size=BITS + 61,
+            max_actions=ACTIONS,
+            max_nodes=config.max_nodes,
+            max_depth=config.max_depth,
+            max_branches=12 * config.max_nodes,
+            exploration=config.exploration,
+        )
+
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+        """Answer the newest episode request, once."""
+        for received in inputs.new(LOCAL_IRM):
+            self._irms[received.message.irm_version] = received.message
+            while len(self._irms) > _KEPT_IRMS:
+                self._irms.popitem(last=False)
+        request = inputs.current(EPISODE)
+        mission = inputs.latest(MISSION)
+        if request is None or request.episode == self._answered:
+            return []
+        self._answered = request.episode
+        returning = mission is not None and mission.message.phase == MissionPhase.RETURN
+        policy = inputs.current(GLOBAL_POLICY)
+        return [Output(LOCAL_POLICY, self._answer(now, request, policy, returning))]
+
+    def _answer(
+        self, now: Stamp, request: EpisodeRequest, policy: GlobalPolicy | None, returning: bool
+    ) -> LocalPolicy:
+        irm = self._irms.get(request.irm_version)
+        if irm is None:
+            return _nothing(now, request, f"Local IRM {request.irm_version} is not here")
+        try:
+            junction = junction_of(request, irm)
+        except ValueError as error:
+            return _nothing(now, request, str(error))
+        entropy = local_entropy(irm)
+        if not returning and self._should_cover(irm, junction, entropy, policy):
+            return self._cover(now, request, irm, junction, entropy, policy)
+        return self._guide(now, request, irm, junction, policy)
+
+    def _should_cover(
+        self, irm: LocalIrm, junction: Junction, entropy: np.ndarray, policy: GlobalPolicy | None
+    ) -> bool:
+        """Phase 2 while enough remains in reach, or when the target is reachable within the Local IRM."""
+        n = irm.size * irm.size
+        cost, move = np.empty(n), np.empty(n, np.int8)
+        p = parameters(self._config.weights)
+        travel_costs(
+            junction.node, irm.size, irm.edge_distance_m, irm.edge_risk, p.k_risk, _MAX_RISK, cost, move
+        )
+        in_reach = float(entropy[_near_reach(irm, cost, self._config.cover_radius_m)].sum())
+        bound = self._config.cover_end_entropy if self._covering else self._config.cover_begin_entropy
+        self._covering = in_reach >= bound
+        if self._covering or policy is None or policy.target < 0:
+            return in_reach > 0.0
+        x, y = planar(policy.map_to_odom).inverse().apply(*policy.target_xyz_m[:2])
+        target = node_at(irm, x, y)
+        return target >= 0 and bool(np.isfinite(cost[target])) and float(entropy.sum()) > 0.0 and (
+            float(entropy[_near_reach(irm, cost, cost[target] + 3.0)].sum()) > 0.0
+        )
+
+    def _cover(
+        self,
+        now: Stamp,
+        request: EpisodeRequest,
+        irm: LocalIrm,
+        junction: Junction,
+        entropy: np.ndarray,
+        policy: GlobalPolicy | None,
+    ) -> LocalPolicy:
+        leaf = leaf_values(irm, policy, self._config.weights)
+        model = coverage_model(irm, entropy, leaf, junction, self._config)
+        seed = int(stream(self._seed, "lcp", request.episode).integers(2**63))
+        report = self._solver.search(
+            search_coverage, model, seed=seed, simulations=request.simulations, should_stop=self._deadline()
+        )
+        tree = self._solver.policy(self._config.min_visits)
+        moves, in_tree = likely_moves(model, tree, junction.node, junction.heading, self._config.path_steps)
+        if not moves:
+            return self._guide(now, request, irm, junction, policy)
+        root = self._solver.root()
+        reason = f"covers: value {root.best_value:.2f} by {report.simulations} simulations"
+        return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, moves, in_tree, tree,
+                       float(root.best_value), report.simulations, report.nodes)  # fmt: skip
+
+    def _deadline(self) -> Callable[[], bool] | None:
+        """Whether the planning time of this episode is over; None where time is not measured (lock-step)."""
+        if self._stopwatch is None:
+            return None
+        watch, ends = self._stopwatch, self._stopwatch() + self._config.seconds_per_deadline
+        return lambda: watch() > ends
+
+    def _guide(
+        self, now: Stamp, request: EpisodeRequest, irm: LocalIrm, junction: Junction, policy: GlobalPolicy | None
+    ) -> LocalPolicy:
+        """Phase 1: along the global path, as far as the Local IRM reaches."""
+        if policy is None or len(policy.path_xyz_m) == 0:
+            return _nothing(now, request, "no target" if policy is None else policy.reason)
+        to_odom = planar(policy.map_to_odom).inverse()
+        places = [to_odom.apply(float(x), float(y)) for x, y, _ in policy.path_xyz_m]
+        p = parameters(self._config.weights)
+        for x, y in reversed(_densify(places)):
+            node = node_at(irm, x, y)
+            if node < 0 or irm.state[node] != 1 or node == junction.node:
+                continue
+            moves = moves_to(irm, junction.node, node, p.k_risk, _MAX_RISK)
+            if moves:
+                reason = f"guides to target {policy.target}"
+                return _policy(now, request, irm, LocalPhase.GUIDE, reason, policy, junction, moves, 0,
+                               _EMPTY_TREE, policy.target_q, 0, 0)  # fmt: skip
+        return _nothing(now, request, f"no way to target {policy.target} in the Local IRM")
+
+    def snapshot(self) -> bytes:
+        """The phase and the last episode; Local IRMs come again."""
+        return pack_snapshot({"covering": self._covering, "answered": self._answered})
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot."""
+        state = unpack_snapshot(snapshot)
+        self._covering, self._answered = bool(state["covering"]), int(state["answered"])
+
+
+def _near_reach(irm: LocalIrm, cost: np.ndarray, radius_m: float) -> np.ndarray:
+    """Nodes that can be seen from nodes within so much travel: those nodes and what lies two nodes around. (n,)"""
+    reached = (cost <= radius_m).reshape(irm.size, irm.size)
+    grown = reached.copy()
+    for _ in range(2):
+        padded = np.pad(grown, 1)
+        grown = (
+            padded[1:-1, 1:-1] | padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+        )
+    return grown.ravel()
+
+
+def _densify(places: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Points every half metre along a path."""
+    dense = places[:1]
+    for (x0, y0), (x1, y1) in zip(places, places[1:], strict=False):
+        steps = max(1, int(np.ceil(np.hypot(x1 - x0, y1 - y0) / 0.5)))
+        dense += [(x0 + (x1 - x0) * i / steps, y0 + (y1 - y0) * i / steps) for i in range(1, steps + 1)]
+    return dense
+
+
+def _policy(
+    now: Stamp,
+    request: EpisodeRequest,
+    irm: LocalIrm,
+    phase: LocalPhase,
+    reason: str,
+    policy: GlobalPolicy | None,
+    junction: Junction,
+    moves: list[int],
+    in_tree: int,
+    tree: PolicyTree,
+    root_value: float,
+    simulations: int,
+    tree_nodes: int,
+) -> LocalPolicy:
+    nodes, points, at = line_of(irm, junction.node, moves)
+    lattice = [(irm.ix0 + n % irm.size, irm.iy0 + n // irm.size) for n in nodes]
+    return LocalPolicy(
+        stamp_ns=now,
+        episode=request.episode,
+        irm_version=irm.irm_version,
+        phase=phase,
+        reason=reason,
+        target=policy.target if policy is not None else -1,
+        root_value=root_value,
+        simulations=simulations,
+        tree_nodes=tree_nodes,
+        planning_ms=0.0,
+        path_lattice=np.array(lattice, np.int32).reshape(-1, 2),
+        path_reward=np.zeros(len(nodes)),
+        path_in_tree=np.array([1 if i <= in_tree else 0 for i in range(len(nodes))], np.uint8),
+        path_xy_m=np.array(points, np.float64).reshape(-1, 2),
+        path_node_point=np.array(at, np.int32),
+        tree_action=tree.node_action,
+        tree_value=np.nan_to_num(tree.node_value),
+        tree_visits=tree.node_visits,
+        child_start=tree.child_start,
+        child_node=tree.child_node,
+        child_observation=tree.child_observation,
+    )
+
+
+def _nothing(now: Stamp, request: EpisodeRequest, reason: str) -> LocalPolicy:
+    none = np.zeros(0)
+    return LocalPolicy(
+        stamp_ns=now,
+        episode=request.episode,
+        irm_version=request.irm_version,
+        phase=LocalPhase.NONE,
+        reason=reason,
+        target=-1,
+        root_value=0.0,
+        simulations=0,
+        tree_nodes=0,
+        planning_ms=0.0,
+        path_lattice=np.zeros((0, 2), np.int32),
+        path_reward=none,
+        path_in_tree=np.zeros(0, np.uint8),
+        path_xy_m=np.zeros((0, 2)),
+        path_node_point=np.zeros(0, np.int32),
+        tree_action=np.zeros(0, np.int32),
+        tree_value=none,
+        tree_visits=np.zeros(0, np.int32),
+        child_start=np.zeros(0, np.int32),
+        child_node=np.zeros(0, np.int32),
+        child_observation=np.zeros(0, np.int32),
+    )

@@ -1,0 +1,217 @@
+"""The mission stage: the only writer of the mission's state."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from planning.frames import Planar
+from planning.graph_mirror import FRONTIER, GraphMirror, RoadMap
+from schemas.base import Pose
+from schemas.contract import SECOND_NS, Inputs, Outputs, Stage, StageSetup, StageSpec, Stamp, outputs
+from schemas.operation import LeftOver, MissionPhase, MissionState
+from schemas.sensing import Odometry
+from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.topics import COMMAND, COVERAGE, GLOBAL_IRM, MISSION, MISSION_GRAPH_REQUEST, ODOMETRY
+from schemas.world import CoverageSummary, GraphRequest
+from services.mission.config import Config
+from services.mission.machine import Facts, Machine
+
+__all__ = ["Config", "MissionStage", "create", "spec"]
+
+_MAX_JUMP_M = 2.0  # between two steps; more is an odometry fault, not travel
+
+
+def spec(config: Config) -> StageSpec:
+    """How to run the stage: periodically, and at once when a command comes."""
+    return StageSpec("mission", int(config.period_s * SECOND_NS), (COMMAND.name,))
+
+
+def create(config: Config, setup: StageSetup) -> Stage:
+    """A mission that has not begun."""
+    return MissionStage(config)
+
+
+class MissionStage:
+    """Holds the state machine, the way home by the graph, and what is left."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.machine = Machine(config)
+        self._mirror = GraphMirror()
+        self._home: Pose | None = None
+        self._at: Pose | None = None
+        self._last_xy: tuple[float, float] | None = None
+        self._distance_m = 0.0
+        self._coverage = 0.0
+        self._asked_ns = -1
+        self._unreachable: list[LeftOver] = []
+        self._way: tuple[int, int, float] = (-1, -1, 0.0)  # graph version, robot node, travel from there home
+
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+        """One step: the mission's state, and a request for the graph when a difference was missed."""
+        odometry = inputs.current(ODOMETRY)
+        if odometry is not None:
+            self._track(odometry)
+        asks = self._update_graph(now, inputs)
+        coverage = inputs.current(COVERAGE)
+        if coverage is not None:
+            self._coverage = coverage.covered_fraction
+            self._unreachable = _unreachable(coverage)
+        left = self._left()
+        return_m = self._return_distance_m()
+        self.machine.step(self._facts(now, inputs, coverage, return_m, len(left)))
+        state = self._state(now, return_m, left)
+        requests = [(MISSION_GRAPH_REQUEST, GraphRequest(stamp_ns=now, have_version=self._mirror.version))]
+        return outputs([(MISSION, state), *(requests if asks else [])])
+
+    def _track(self, odometry: Odometry) -> None:
+        """Follow the robot: distance in `odom`, where nothing jumps; place and home in `map`."""
+        pose = odometry.pose
+        self._at = _in_map(odometry)
+        if self._home is None:
+            self._home = self._at
+        if self._last_xy is not None:
+            moved = math.hypot(pose.x_m - self._last_xy[0], pose.y_m - self._last_xy[1])
+            self._distance_m += moved if moved < _MAX_JUMP_M else 0.0
+        self._last_xy = (pose.x_m, pose.y_m)
+
+    def _update_graph(self, now: Stamp, inputs: Inputs) -> bool:
+        """Apply what came; whether the whole graph must be asked for now."""
+        fits = True
+        for received in inputs.new(GLOBAL_IRM):
+            fits = self._mirror.apply(received.message)
+        if fits or (self._asked_ns >= 0 and now - self._asked_ns < self.config.ask_again_s * SECOND_NS):
+            return False
+        self._asked_ns = now
+        return True
+
+    def _facts(
+        self, now: Stamp, inputs: Inputs, coverage: CoverageSummary | None, return_m: float, left: int
+    ) -> Facts:
+        commands = tuple((c.message.command_id, c.message.kind) for c in inputs.new(COMMAND))
+        return Facts(
+            now_ns=now,
+            localised=self._home is not None,
+            distance_m=self._distance_m,
+            return_distance_m=return_m,
+            home_distance_m=self._home_distance_m(),
+            settled=None if coverage is None else coverage.settled,
+            covered_area_m2=None if coverage is None else coverage.covered_area_m2,
+            left=left,
+            commands=commands,
+        )
+
+    def _home_distance_m(self) -> float:
+        if self._home is None or self._at is None:
+            return math.inf
+        return math.dist(_xy(self._home), _xy(self._at))
+
+    def _return_distance_m(self) -> float:
+        """Travel home: over the graph with the straight ends; the way that was driven where the graph has
+        none.
+        """
+        if self._home is None or self._at is None:
+            return 0.0
+        straight = self._home_distance_m()
+        key = (self._mirror.version, self._mirror.robot_node)
+        if self._way[:2] != key:
+            self._way = (*key, self._graph_travel_m(self._mirror.road_map()))
+        robot = self._mirror.road_map().index_of(self._mirror.robot_node)
+        if robot < 0 or not math.isfinite(self._way[2]):
+            return max(straight, self._distance_m)
+        to_node = math.dist(self._mirror.road_map().xyz_m[robot, :2], _xy(self._at))
+        return max(straight, to_node + self._way[2])
+
+    def _graph_travel_m(self, road_map: RoadMap) -> float:
+        """From the robot's breadcrumb over the graph to the one nearest to home, and from there home."""
+        robot = road_map.index_of(self._mirror.robot_node)
+        if robot < 0 or self._home is None:
+            return math.inf
+        end = road_map.nearest_breadcrumb((self._home.x_m, self._home.y_m, self._home.z_m))
+        if end < 0:
+            return math.inf
+        travel, _ = road_map.travel_from(robot)
+        return float(travel[end]) + math.dist(road_map.xyz_m[end, :2], _xy(self._home))
+
+    def _left(self) -> list[LeftOver]:
+        """What is not covered and why: unreachable frontiers, and those still to be visited; best first."""
+        road_map = self._mirror.road_map()
+        open_reason = "not visited yet"
+        if self.machine.phase in (MissionPhase.DONE, MissionPhase.STOPPED):
+            open_reason = f"the mission ended first ({self.machine.finish.value})"
+        elif self.machine.phase == MissionPhase.RETURN:
+            open_reason = f"turned back first ({self.machine.pending.value})"
+        left = list(self._unreachable)
+        for index in np.flatnonzero(road_map.kind == FRONTIER):
+            x_m, y_m, _ = road_map.xyz_m[index].tolist()
+            left.append(LeftOver(x_m=x_m, y_m=y_m, gain=float(road_map.gain[index]), reason=open_reason))
+        left.sort(key=lambda place: (-place.gain, place.x_m, place.y_m))
+        return left[: self.config.max_left]
+
+    def _state(self, now: Stamp, return_m: float, left: list[LeftOver]) -> MissionState:
+        started_m = self.machine.start_m if self.machine.started_ns >= 0 else self._distance_m
+        return MissionState(
+            stamp_ns=now,
+            phase=self.machine.phase,
+            finish=self.machine.finish,
+            reason=self.machine.reason,
+            elapsed_s=self.machine.elapsed_s(now),
+            time_budget_s=self.config.time_budget_s,
+            distance_m=self._distance_m - started_m,
+            return_distance_m=return_m,
+            home=self._home or Pose(),
+            coverage=self._coverage,
+            left=left,
+        )
+
+    def snapshot(self) -> bytes:
+        """Machine, graph, home, distance and what is left."""
+        state = {
+            "machine": self.machine.snapshot(),
+            "graph": self._mirror.snapshot(),
+            "home": None if self._home is None else self._home.model_dump(),
+            "at": None if self._at is None else self._at.model_dump(),
+            "last_xy": self._last_xy,
+            "distance_m": self._distance_m,
+            "coverage": self._coverage,
+            "asked_ns": self._asked_ns,
+            "unreachable": [place.model_dump() for place in self._unreachable],
+        }
+        return pack_snapshot(state)
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot."""
+        state = unpack_snapshot(snapshot)
+        self.machine.restore(state["machine"])
+        self._mirror.restore(state["graph"])
+        self._home = Pose(**state["home"]) if state["home"] else None
+        self._at = Pose(**state["at"]) if state["at"] else None
+        self._last_xy = (state["last_xy"][0], state["last_xy"][1]) if state["last_xy"] else None
+        self._distance_m, self._coverage = state["distance_m"], state["coverage"]
+        self._asked_ns = state["asked_ns"]
+        self._unreachable = [LeftOver(**place) for place in state["unreachable"]]
+        self._way = (-1, -1, 0.0)
+
+
+def _in_map(odometry: Odometry) -> Pose:
+    """The robot's pose in `map`."""
+    frame, pose = odometry.map_to_odom, odometry.pose
+    at = Planar(frame.x_m, frame.y_m, frame.yaw_rad).compose(Planar(pose.x_m, pose.y_m, pose.yaw_rad))
+    return Pose(x_m=at.x_m, y_m=at.y_m, z_m=frame.z_m + pose.z_m, yaw_rad=at.yaw_rad)
+
+
+def _xy(pose: Pose) -> tuple[float, float]:
+    return pose.x_m, pose.y_m
+
+
+def _unreachable(coverage: CoverageSummary) -> list[LeftOver]:
+    """The frontiers that were given up; rows without a reason say so."""
+    reasons = [*coverage.unreachable_reason, *["unreachable"] * coverage.unreachable_xy_m.shape[0]]
+    return [
+        LeftOver(x_m=float(xy[0]), y_m=float(xy[1]), gain=float(gain), reason=reason)
+        for xy, gain, reason in zip(
+            coverage.unreachable_xy_m, coverage.unreachable_gain, reasons, strict=False
+        )
+    ]

@@ -1,0 +1,406 @@
+"""The reconciler stage: opens episodes, reconciles policies, and is the only one that emits motion."""
+
+from __future__ import annotations
+
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.coverage_model import rollout_value
+from planning.grid import GridSpec
+from planning.pomcp import random_stream
+from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
+from schemas.policy import EpisodeRequest, LocalPhase, LocalPolicy, Plan, SafetyState
+from schemas.sensing import FollowerState, Odometry
+from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.topics import EPISODE, FOLLOWER, LOCAL_IRM, LOCAL_POLICY, MISSION, ODOMETRY, PLAN, RISK_MAP
+from schemas.world import LocalIrm
+from services.reconciler.config import Config
+from services.reconciler.episode import (
+    Committed,
+    Opened,
+    cover_along,
+    heading_index,
+    junction_particles,
+    line_to_lattice,
+    model_here,
+    moves_between,
+    node_index,
+    usable_nodes,
+)
+from services.reconciler.path import (
+    STEP_M,
+    Ground,
+    arc_lengths,
+    first_hazard,
+    headings,
+    project,
+    resample,
+    smooth,
+    speeds,
+)
+from services.reconciler.safety import SafetyInputs, SafetyLimits, Verdict, judge
+from services.reconciler.tau import choose_tau, tau_terms
+
+__all__ = ["Config", "ReconcilerStage", "create", "spec"]
+
+_NO_POINTS = np.zeros((0, 2))
+_NO_NODES = np.zeros((0, 2), np.int64)
+_SOON_M = 2.5
+"""With less of the path left than this a new episode opens at once."""
+
+
+def spec(config: Config) -> StageSpec:
+    """How to run the stage: at 10 Hz, and at once on risk maps and answers."""
+    return StageSpec("reconciler", SECOND_NS // 10, (RISK_MAP.name, LOCAL_POLICY.name), latency_ns=SECOND_NS // 100)
+
+
+def create(config: Config, setup: StageSetup) -> Stage:
+    """A reconciler stage."""
+    return ReconcilerStage(config, setup.seed)
+
+
+class ReconcilerStage:
+    """Holds the committed policy, the open episode and what was last published."""
+
+    def __init__(self, config: Config, seed: int) -> None:
+        self._config = config
+        self._seed = seed
+        self._committed: Committed | None = None
+        self._opened: Opened | None = None
+        self._at = 0
+        self._end = 0
+        self._episode = 0
+        self._opened_ns = -(10**18)
+        self._answered_ns = 0
+        self._plan_id = 0
+        self._published_ns = -(10**18)
+        self._changed = False
+        self._why = "starting"
+        self._tau_s = 0.0
+        self._kept_m = 0.0
+        self._trouble_ns = -1
+        self._value_ratio = 1.0
+        self._plan: Plan | None = None
+
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+        """One cycle: safety first, then the path, then episodes."""
+        odometry, risk = inputs.latest(ODOMETRY), inputs.latest(RISK_MAP)
+        verdict = self._judge(now, inputs)
+        if odometry is None or risk is None:
+            return []
+        g = risk.message.grid
+        ground = Ground(
+            GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height), risk.message.state, risk.message.clearance_m
+        )
+        found: Outputs = []
+        follower = inputs.current(FOLLOWER)
+        self._follow(now, odometry.message, follower)
+        for received in inputs.new(LOCAL_POLICY):
+            self._install(now, received.message, odometry.message, ground)
+        if risk.fresh or self._changed:
+            self._check_hazards(ground, odometry.message)
+        irm = inputs.current(LOCAL_IRM)
+        if verdict.may_move and irm is not None and self._wants_episode(now):
+            found += self._open(now, irm, odometry.message, ground)
+        found += self._publish(now, verdict, odometry.message, ground, risk.message.stamp_ns)
+        return found
+
+    # --- safety -----------------------------------------------------------------------------------------------
+
+    def _judge(self, now: Stamp, inputs: Inputs) -> Verdict:
+        c = self._config
+        mission = inputs.current(MISSION)
+        waiting = (now - self._answered_ns) / SECOND_NS if self._opened is not None else 0.0
+        return judge(
+            SafetyLimits(c.risk_stale_s, c.odometry_stale_s, c.irm_stale_s, c.policy_silent_s),
+            SafetyInputs(
+                _age_s(inputs, RISK_MAP),
+                _age_s(inputs, ODOMETRY),
+                _age_s(inputs, LOCAL_IRM),
+                waiting,
+                mission.phase if mission is not None else None,
+            ),
+        )
+
+    def _check_hazards(self, ground: Ground, odometry: Odometry) -> None:
+        """Truncate the path before the first place where the robot does not fit or the ground is unknown."""
+        if self._committed is None:
+            return
+        c, s = self._config, ground.spec
+        points = self._committed.points
+        hazard = first_hazard(
+            points, self._at + 2, ground.state, ground.clearance_m, s.resolution_m, s.ix0, s.iy0,
+            c.footprint_radius_m - 0.05,
+        )  # fmt: skip
+        end = len(points) - 1 if hazard < 0 else max(hazard - 3, self._at)
+        if end != self._end:
+            self._end, self._changed = end, True
+            if hazard >= 0:
+                self._why = f"hazard {(hazard - self._at) * STEP_M:.1f} m ahead"
+
+    # --- following ----------------------------------------------------------------------------------------------
+
+    def _follow(self, now: Stamp, odometry: Odometry, follower: FollowerState | None) -> None:
+        """Where the robot is on its path; drop the path when the robot has left it or cannot go on."""
+        if self._committed is None:
+            return
+        points = self._committed.points
+        self._at, off = project(
+            points, odometry.pose.x_m, odometry.pose.y_m, max(self._at - 3, 0), min(self._at + 25, len(points) - 1)
+        )
+        if off > self._config.off_path_m:
+            self._drop("off the path")
+        trouble = follower is not None and follower.plan_id == self._plan_id and (follower.blocked or follower.stuck)
+        if not trouble:
+            self._trouble_ns = -1
+        elif self._trouble_ns < 0:
+            self._trouble_ns = now
+        elif now - self._trouble_ns > self._config.blocked_s * SECOND_NS:
+            self._trouble_ns = -1
+            self._drop("blocked")
+
+    def _drop(self, why: str) -> None:
+        self._committed, self._opened = None, None
+        self._at = self._end = 0
+        self._changed, self._why = True, why
+
+    def _left_m(self) -> float:
+        return max(0, self._end - self._at) * STEP_M if self._committed is not None else 0.0
+
+    # --- episodes -----------------------------------------------------------------------------------------------
+
+    def _wants_episode(self, now: Stamp) -> bool:
+        c = self._config
+        if self._opened is not None:
+            if now - self._opened.opened_ns < c.episode_timeout_s * SECOND_NS:
+                return False
+            self._opened = None
+        since = (now - self._opened_ns) / SECOND_NS
+        return since >= c.episode_period_s or (self._left_m() < _SOON_M and since >= 0.3)
+
+    def _open(self, now: Stamp, irm: LocalIrm, odometry: Odometry, ground: Ground) -> Outputs:
+        self._episode += 1
+        self._opened_ns = now
+        opened = self._keep_prefix(now, irm, odometry) or self._from_here(now, irm, odometry, ground)
+        if opened is None:
+            self._why = "no node of the Local IRM in reach"
+            return []
+        self._opened, request = opened
+        self._answered_ns = max(self._answered_ns, now)
+        return [Output(EPISODE, request)]
+
+    def _keep_prefix(
+        self, now: Stamp, irm: LocalIrm, odometry: Odometry
+    ) -> tuple[Opened, EpisodeRequest] | None:
+        """Junction on the old path: tau* of it is kept. None when too little of it is left."""
+        if self._committed is None:
+            return None
+        c, committed = self._config, self._committed
+        reachable = [i for i in usable_nodes(committed, irm, self._at) if committed.node_point[i] <= self._end]
+        v = odometry.speed_mps
+        least_m = abs(v) * c.planning_latency_s + v * v / (2.0 * c.max_acceleration_mps2) + 0.2
+        ahead = [int(committed.node_point[i] - self._at) * STEP_M for i in reachable]
+        first = next((j for j, m in enumerate(ahead) if m >= least_m), None)
+        if first is None:
+            return None
+        covered = np.zeros(irm.size, np.uint64)
+        start = self._node(irm, committed, reachable[0])
+        heading = self._heading(committed, reachable[0])
+        model = model_here(irm, start, heading, covered, c)
+        moves = moves_between(committed, reachable[0], reachable[-1])
+        terms = tau_terms(
+            model, start, heading, moves, c.replan_rollouts, self._value_ratio, self._stream_seed()
+        )
+        most = max(first, sum(1 for m in ahead if m <= c.max_kept_m) - 1)
+        if c.profile == "paper":
+            most = len(ahead) - 1
+        kept = choose_tau(terms, first, most, c.regulariser, c.profile == "paper")
+        if kept < first:
+            return None
+        cover_along(model, committed, irm, reachable[: kept + 1], covered)
+        point = int(committed.node_point[reachable[kept]])
+        node = self._node(irm, committed, reachable[kept])
+        opened = Opened(
+            number=self._episode,
+            opened_ns=now,
+            irm=irm,
+            prefix=committed.points[self._at : point + 1],
+            kept_lattice=committed.lattice[reachable[: kept + 1]],
+            kept_point=committed.node_point[reachable[: kept + 1]] - self._at,
+            tau_s=ahead[kept] / max(c.max_speed_mps, 0.1),
+            rollout_value=self._rollouts(model, node, self._heading(committed, reachable[kept]), covered),
+            keeps_old=True,
+        )
+        return opened, self._request(now, irm, node, self._heading(committed, reachable[kept]), odometry, covered, opened)
+
+    def _from_here(
+        self, now: Stamp, irm: LocalIrm, odometry: Odometry, ground: Ground
+    ) -> tuple[Opened, EpisodeRequest] | None:
+        """Junction at the nearest node: nothing is kept but the way to it."""
+        found = line_to_lattice(irm, ground, odometry, self._config.footprint_radius_m - 0.03, set())
+        if found is None:
+            return None
+        node, line = found
+        prefix = resample(line)
+        covered = np.zeros(irm.size, np.uint64)
+        heading = heading_index(odometry.pose.yaw_rad)
+        if len(prefix) > 4:
+            heading = heading_index(float(headings(prefix)[-1]))
+        model = model_here(irm, node, heading, covered, self._config)
+        lattice = np.array([[irm.ix0 + node % irm.size, irm.iy0 + node // irm.size]], np.int64)
+        opened = Opened(
+            self._episode, now, irm, prefix, lattice, np.array([len(prefix) - 1], np.int64), 0.0,
+            self._rollouts(model, node, heading, covered), False,
+        )  # fmt: skip
+        return opened, self._request(now, irm, node, heading, odometry, covered, opened)
+
+    def _request(
+        self,
+        now: Stamp,
+        irm: LocalIrm,
+        node: int,
+        heading: int,
+        odometry: Odometry,
+        covered: NDArray[np.uint64],
+        opened: Opened,
+    ) -> EpisodeRequest:
+        c = self._config
+        nodes, at_headings, weights = junction_particles(
+            irm, node, heading, odometry, c.particles, self._seed, self._episode
+        )
+        return EpisodeRequest(
+            stamp_ns=now,
+            episode=self._episode,
+            irm_version=irm.irm_version,
+            junction_ns=now + int(opened.tau_s * SECOND_NS),
+            junction_speed_mps=max(odometry.speed_mps, 0.0),
+            horizon_m=c.horizon_m,
+            simulations=c.simulations,
+            particle_node=nodes,
+            particle_heading=at_headings,
+            particle_weight=weights,
+            covered=covered,
+        )
+
+    def _rollouts(self, model, node: int, heading: int, covered: NDArray[np.uint64]) -> float:  # type: ignore[no-untyped-def]
+        rng = random_stream(self._stream_seed())
+        return float(rollout_value(model, node, heading, covered, rng, self._config.replan_rollouts))
+
+    def _stream_seed(self) -> int:
+        return (self._seed * 1_000_003 + self._episode) & 0x7FFFFFFFFFFFFFFF
+
+    @staticmethod
+    def _node(irm: LocalIrm, committed: Committed, position: int) -> int:
+        return node_index(irm, int(committed.lattice[position, 0]), int(committed.lattice[position, 1]))
+
+    @staticmethod
+    def _heading(committed: Committed, position: int) -> int:
+        point = int(committed.node_point[position])
+        return heading_index(float(headings(committed.points)[max(point - 1, 0)]))
+
+    # --- answers ------------------------------------------------------------------------------------------------
+
+    def _install(self, now: Stamp, policy: LocalPolicy, odometry: Odometry, ground: Ground) -> None:
+        """Concatenate the kept prefix and the new policy (Eq. 15); answers to other episodes are dropped."""
+        opened = self._opened
+        if opened is None or policy.episode != opened.number:
+            return
+        self._opened, self._answered_ns = None, now
+        if policy.phase == LocalPhase.NONE or len(policy.path_lattice) == 0:
+            self._why = policy.reason
+            return
+        if policy.phase == LocalPhase.COVER and opened.rollout_value > 0.1:
+            ratio = min(max(policy.root_value / opened.rollout_value, 1.0), 2.0)
+            self._value_ratio += 0.2 * (ratio - self._value_ratio)
+        self._commit(opened, policy, odometry, ground)
+        self._why = policy.reason
+
+    def _commit(self, opened: Opened, policy: LocalPolicy, odometry: Odometry, ground: Ground) -> None:
+        prefix = opened.prefix
+        raw = np.concatenate([prefix, policy.path_xy_m[1:]]) if len(prefix) else policy.path_xy_m
+        fixed = len(prefix) if opened.keeps_old else max(1, len(prefix) // 2)
+        points = smooth(raw, fixed, ground, self._config)
+        lattice = np.concatenate([opened.kept_lattice, policy.path_lattice[1:].astype(np.int64)])
+        anchors = policy.path_xy_m[policy.path_node_point[1:]]
+        node_point = list(opened.kept_point)
+        at = int(node_point[-1]) if node_point else 0
+        for x, y in anchors:
+            at, _ = project(points, float(x), float(y), min(at, len(points) - 1), min(at + 30, len(points) - 1))
+            node_point.append(at)
+        self._committed = Committed(points, lattice, np.array(node_point, np.int64), policy.target)
+        self._at, _ = project(points, odometry.pose.x_m, odometry.pose.y_m, 0, min(40, len(points) - 1))
+        self._end = len(points) - 1
+        self._tau_s = opened.tau_s
+        self._kept_m = float(arc_lengths(prefix)[-1]) if opened.keeps_old and len(prefix) else 0.0
+        self._changed = True
+
+    # --- motion -------------------------------------------------------------------------------------------------
+
+    def _publish(
+        self, now: Stamp, verdict: Verdict, odometry: Odometry, ground: Ground, risk_stamp_ns: int
+    ) -> Outputs:
+        """A new plan when something changed, else the same plan again so that it does not expire."""
+        moving = verdict.may_move and self._committed is not None
+        was_moving = self._plan is not None and self._plan.valid
+        state_changed = self._plan is None or self._plan.safety != verdict.state or was_moving != moving
+        due = now - self._published_ns >= 0.3 * SECOND_NS
+        if not (self._changed or state_changed or due):
+            return []
+        if self._changed or state_changed:
+            self._plan_id += 1
+        share = self._config.degraded_speed_share if verdict.state == SafetyState.DEGRADED else 1.0
+        self._plan = self._make_plan(now, verdict, odometry, ground, risk_stamp_ns, moving, share)
+        self._changed, self._published_ns = False, now
+        return [Output(PLAN, self._plan)]
+
+    def _make_plan(
+        self,
+        now: Stamp,
+        verdict: Verdict,
+        odometry: Odometry,
+        ground: Ground,
+        risk_stamp_ns: int,
+        moving: bool,
+        share: float,
+    ) -> Plan:
+        points = _NO_POINTS
+        if moving and self._committed is not None:
+            points = self._committed.points[max(self._at - 1, 0) : self._end + 1]
+        speed, time_s = speeds(points, odometry.speed_mps, ground, self._config, share)
+        return Plan(
+            stamp_ns=now,
+            plan_id=max(self._plan_id, 1),
+            episode=self._episode,
+            valid=moving and len(points) > 0,
+            safety=verdict.state,
+            reason=verdict.reason or self._why,
+            tau_s=self._tau_s,
+            kept_points=min(len(points), round(self._kept_m / STEP_M)),
+            ttl_s=self._config.plan_ttl_s,
+            risk_stamp_ns=risk_stamp_ns,
+            x_m=np.ascontiguousarray(points[:, 0]),
+            y_m=np.ascontiguousarray(points[:, 1]),
+            yaw_rad=headings(points),
+            speed_mps=speed,
+            time_s=time_s,
+        )
+
+    def snapshot(self) -> bytes:
+        """Counters only: after a restart the robot plans anew from where it stands."""
+        return pack_snapshot(
+            {"episode": self._episode, "plan_id": self._plan_id, "value_ratio": self._value_ratio}
+        )
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot; ids go on increasing."""
+        state = unpack_snapshot(snapshot)
+        self._episode, self._plan_id = int(state["episode"]), int(state["plan_id"]) + 1
+        self._value_ratio = float(state["value_ratio"])
+
+
+def _age_s(inputs: Inputs, topic) -> float | None:  # type: ignore[no-untyped-def]
+    received = inputs.latest(topic)
+    return None if received is None else received.age_ns / SECOND_NS
+
+

@@ -1,0 +1,99 @@
+"""From the belief about obstacles to hazard, state and clearance (collision risk; flat ground)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from planning.grid import FREE, LETHAL, UNKNOWN
+from planning.kernels import njit
+
+
+class RiskLayers(NamedTuple):
+    """The layers of a risk map, all (h, w); hazards in 1/m (see `schemas.world.RiskMap`)."""
+
+    state: NDArray[np.uint8]
+    hazard_mean: NDArray[np.float32]
+    hazard_variance: NDArray[np.float32]
+    hazard_cvar: NDArray[np.float32]
+    clearance_m: NDArray[np.float32]
+
+
+def cvar_factor(alpha: float) -> float:
+    """CVaR_alpha of a normal variable is mean + factor * deviation: pdf(quantile(alpha)) / (1 - alpha)."""
+    return float(norm.pdf(norm.ppf(alpha)) / (1.0 - alpha))
+
+
+def collision_layers(
+    log_odds: NDArray[np.float32],
+    offset_x: NDArray[np.float32],
+    offset_y: NDArray[np.float32],
+    resolution_m: float,
+    free_log_odds: float,
+    clamp_log_odds: float,
+    hazard_per_m: float,
+    alpha: float,
+    max_clearance_m: float,
+) -> RiskLayers:
+    """State, hazard and clearance of each cell from its obstacle log-odds.
+
+    log_odds, offset_x, offset_y: (h, w); the offsets are of the mean hit from the cell's centre, m. The hazard rate of
+    a cell is hazard_per_m times the probability of an obstacle above that of the clearest possible cell.
+    """
+    state = np.full(log_odds.shape, UNKNOWN, dtype=np.uint8)
+    state[log_odds < -free_log_odds] = FREE
+    state[log_odds > 0.0] = LETHAL
+    p = 1.0 / (1.0 + np.exp(-log_odds))
+    floor = 1.0 / (1.0 + math.exp(clamp_log_odds))
+    p = np.clip((p - floor) / (1.0 - floor), 0.0, 1.0)
+    p[state == UNKNOWN] = 0.5
+    mean = (hazard_per_m * p).astype(np.float32)
+    variance = (hazard_per_m**2 * p * (1.0 - p)).astype(np.float32)
+    cvar = np.minimum(mean + cvar_factor(alpha) * np.sqrt(variance), hazard_per_m).astype(np.float32)
+    clearance = np.full(log_odds.shape, max_clearance_m, dtype=np.float32)
+    stamp_clearance(state == LETHAL, offset_x, offset_y, resolution_m, max_clearance_m, clearance)
+    return RiskLayers(state, mean, variance, cvar, clearance)
+
+
+@njit
+def stamp_clearance(
+    lethal: NDArray[np.bool_],
+    offset_x: NDArray[np.float32],
+    offset_y: NDArray[np.float32],
+    resolution_m: float,
+    max_clearance_m: float,
+    out_m: NDArray[np.float32],
+) -> None:
+    """Distance from each cell's centre to the nearest lethal point, up to a maximum; 0 in lethal cells.
+
+    Exact for the points (mean hits inside lethal cells), unlike a distance transform of whole cells: a door of 0.8 m
+    must not lose a cell on either side. Cells that lethal cells surround on all four sides cannot be the nearest.
+    """
+    height, width = lethal.shape
+    reach = math.ceil(max_clearance_m / resolution_m) + 1
+    for row in range(height):
+        for column in range(width):
+            if not lethal[row, column]:
+                continue
+            out_m[row, column] = 0.0
+            if (
+                0 < row < height - 1
+                and 0 < column < width - 1
+                and lethal[row - 1, column]
+                and lethal[row + 1, column]
+                and lethal[row, column - 1]
+                and lethal[row, column + 1]
+            ):
+                continue
+            ox, oy = offset_x[row, column], offset_y[row, column]
+            for r in range(max(0, row - reach), min(height, row + reach + 1)):
+                dy = (r - row) * resolution_m - oy
+                for c in range(max(0, column - reach), min(width, column + reach + 1)):
+                    dx = (c - column) * resolution_m - ox
+                    squared = dx * dx + dy * dy
+                    if squared < out_m[r, c] * out_m[r, c]:
+                        out_m[r, c] = math.sqrt(squared)

@@ -1,0 +1,160 @@
+"""The judge: which ground the robot could cover, and which it has seen from its true poses.
+
+Reachable ground is exact on the judge's cells: the configuration space is every cell on whose centre the disc
+overlaps no wall; its 4-connected part that holds the start is swept by the disc. Dilation by the disc equals
+a threshold on the Euclidean distance transform, with the distance taken to the walls' areas, as in the
+robot's own contact test, and not to their cells' centres.
+
+The disc's centre is tried on cell centres only: a passage wider than the footprint by less than one cell may
+count as closed, never a narrower one as open. Worlds coarser than 0.1 m are judged on cells cut to 0.1 m
+or less, so that a gap of two coarse cells is not lost between their centres.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.grid import GridSpec
+from planning.kernels import njit
+from services.sim.config import CoverageSensorConfig
+from services.sim.geometry import configuration_space, dilate, disc_holds_centre, flood, sees_cell
+from services.sim.world import StartError, World
+
+COARSEST_CELL_M = 0.1
+
+
+class Judge:
+    """Ground truth of coverage for one world, footprint and coverage sensor.
+
+    A reachable cell is covered when its centre has been within range and field of view of a true pose, with
+    no wall on the line between: the simulator's own line of sight, whatever the planners believe. Detection
+    probability is a matter of belief; here every look counts.
+    """
+
+    def __init__(self, world: World, footprint_radius_m: float, sensor: CoverageSensorConfig) -> None:
+        self.spec, self._occupied = refine(world)
+        self.reachable = reachable_ground(self.spec, self._occupied, world.start, footprint_radius_m)
+        """bool[height, width] on `spec`: ground that the footprint can sweep over."""
+        self.covered = np.zeros(self.spec.shape, dtype=np.bool_)
+        """bool[height, width] on `spec`: reachable ground seen so far."""
+        self._pending = self.reachable.copy()
+        self._range_cells = sensor.range_m / self.spec.resolution_m
+        half_fov_rad = math.radians(sensor.fov_deg) / 2.0
+        self._cos_half_fov = math.cos(half_fov_rad) if sensor.fov_deg < 360.0 else -2.0
+        self._reachable_cells = int(np.count_nonzero(self.reachable))
+        self._covered_cells = 0
+
+    def update(self, x_m: float, y_m: float, yaw_rad: float) -> int:
+        """Look once from a true pose; returns how many cells are newly covered."""
+        cell = self.spec.resolution_m
+        x, y = x_m / cell - self.spec.ix0, y_m / cell - self.spec.iy0
+        view = np.array([x, y, math.cos(yaw_rad), math.sin(yaw_rad)])
+        new = look(self._occupied, self._pending, self.covered, view, self._range_cells, self._cos_half_fov)
+        self._covered_cells += new
+        return new
+
+    @property
+    def coverage_fraction(self) -> float:
+        """Covered share of the reachable ground, 0 to 1."""
+        return self._covered_cells / self._reachable_cells
+
+    @property
+    def covered_area_m2(self) -> float:
+        """Area of the reachable ground seen so far."""
+        return self._covered_cells * self.spec.resolution_m**2
+
+    @property
+    def reachable_area_m2(self) -> float:
+        """Area of the ground that the footprint can sweep over."""
+        return self._reachable_cells * self.spec.resolution_m**2
+
+    def set_covered(self, covered: NDArray[np.bool_]) -> None:
+        """Take over a coverage mask (from a snapshot). Raises ValueError if its shape differs."""
+        if covered.shape != self.spec.shape:
+            raise ValueError(f"coverage mask of shape {covered.shape}, need {self.spec.shape}")
+        self.covered = covered & self.reachable
+        self._pending = self.reachable & ~self.covered
+        self._covered_cells = int(np.count_nonzero(self.covered))
+
+
+def refine(world: World) -> tuple[GridSpec, NDArray[np.bool_]]:
+    """The world on cells of at most `COARSEST_CELL_M`: each cell cut into k x k."""
+    spec = world.spec
+    cuts = max(1, math.ceil(spec.resolution_m / COARSEST_CELL_M - 1e-6))
+    if cuts == 1:
+        return spec, world.occupied
+    finer = GridSpec(
+        spec.resolution_m / cuts, spec.ix0 * cuts, spec.iy0 * cuts, spec.width * cuts, spec.height * cuts
+    )
+    occupied = np.repeat(np.repeat(world.occupied, cuts, axis=0), cuts, axis=1)
+    occupied.setflags(write=False)  # as the world's own: another kind of array would be another compilation
+    return finer, occupied
+
+
+def reachable_ground(
+    spec: GridSpec, occupied: NDArray[np.bool_], start: tuple[float, float, float], footprint_radius_m: float
+) -> NDArray[np.bool_]:
+    """Cells whose centre the disc sweeps over while its own centre roams the cells it can reach.
+
+    Raises StartError if the disc fits on no cell next to the start.
+    """
+    radius_cells = footprint_radius_m / spec.resolution_m
+    free = configuration_space(occupied, radius_cells)
+    row, column = _nearest_free(spec, free, start)
+    return dilate(flood(free, row, column), disc_holds_centre(radius_cells), False)
+
+
+def _nearest_free(
+    spec: GridSpec, free: NDArray[np.bool_], start: tuple[float, float, float]
+) -> tuple[int, int]:
+    """The free cell nearest to the start, no farther than two cells off."""
+    x, y = start[0] / spec.resolution_m - spec.ix0, start[1] / spec.resolution_m - spec.iy0
+    row, column = math.floor(y), math.floor(x)
+    around = [
+        (math.hypot(r + 0.5 - y, c + 0.5 - x), r, c)
+        for r in range(row - 2, row + 3)
+        for c in range(column - 2, column + 3)
+        if spec.contains(r, c) and free[r, c]
+    ]
+    if not around:
+        raise StartError(
+            f"the footprint does not fit at the start ({start[0]:g}, {start[1]:g}): choose another"
+        )
+    _, row, column = min(around)
+    return row, column
+
+
+@njit
+def look(
+    occupied: NDArray[np.bool_],
+    pending: NDArray[np.bool_],
+    covered: NDArray[np.bool_],
+    view: NDArray[np.float64],
+    range_cells: float,
+    cos_half_fov: float,
+) -> int:
+    """Move every pending cell that is seen to `covered` (both changed in place); returns how many.
+
+    `view` is (x, y, cos yaw, sin yaw) in cells. Only pending cells are traced, one exact line each.
+    """
+    x, y = view[0], view[1]
+    height, width = pending.shape
+    row_low, row_high = max(0, math.floor(y - range_cells)), min(height - 1, math.floor(y + range_cells))
+    column_low, column_high = max(0, math.floor(x - range_cells)), min(width - 1, math.floor(x + range_cells))
+    new = 0
+    for row in range(row_low, row_high + 1):
+        for column in range(column_low, column_high + 1):
+            if not pending[row, column]:
+                continue
+            dx, dy = column + 0.5 - x, row + 0.5 - y
+            distance = math.sqrt(dx * dx + dy * dy)
+            if distance > range_cells or dx * view[2] + dy * view[3] < cos_half_fov * distance:
+                continue
+            if sees_cell(occupied, x, y, row, column):
+                pending[row, column] = False
+                covered[row, column] = True
+                new += 1
+    return new

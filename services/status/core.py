@@ -1,0 +1,297 @@
+"""The status of the mission, put together from messages: no HTTP, no transport, no clock of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+
+from planning.frames import Planar
+from planning.graph_mirror import FRONTIER, GraphMirror
+from planning.grid import GridSpec
+from schemas.base import Message, Pose
+from schemas.contract import SECOND_NS
+from schemas.operation import JudgeReport, MissionState, StageHealth
+from schemas.policy import GlobalPolicy, Plan
+from schemas.sensing import Odometry
+from schemas.topics import health_topic, topic_named
+from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest
+from services.status.canvas import TileCanvas
+from services.status.config import Config
+from services.status.picture import Picture
+from services.status.report import (
+    CoverageReport,
+    MissionReport,
+    PlaceReport,
+    PlanReport,
+    StageReport,
+    StatusReport,
+    TargetReport,
+    TopicReport,
+)
+
+_RATE_SMOOTHING = 0.2
+_M = TypeVar("_M", bound=Message)
+
+
+@dataclass(slots=True)
+class _Seen:
+    """One topic as received: the newest message, when it came (ns, local monotonic), how many, mean
+    interval.
+    """
+
+    message: Message
+    received_ns: int
+    count: int = 1
+    interval_s: float = 0.0
+
+
+class StatusCore:
+    """Takes in messages and answers what the mission does. Not thread safe: the adapter locks around it."""
+
+    def __init__(self, config: Config, robot: str) -> None:
+        self.config = config
+        self.robot = robot
+        self.canvas = TileCanvas()
+        self.target_switches = 0
+        self._seen: dict[str, _Seen] = {}
+        self._trajectory: list[tuple[float, float]] = []
+        self._mirror = GraphMirror()
+        self._graph_fits = True
+        self._asked_ns = -1
+
+    def observe(self, topic_name: str, message: Message, now_ns: int) -> None:
+        """Take in one message. now_ns: local monotonic clock, the same one that the other calls are given."""
+        self._note(topic_name, message, now_ns)
+        if isinstance(message, Odometry):
+            self._follow(message)
+        elif isinstance(message, CoverageWindow):
+            grid = message.grid
+            spec = GridSpec(grid.resolution_m, grid.ix0, grid.iy0, grid.width, grid.height)
+            self.canvas.paste(spec, message.cell)
+        elif isinstance(message, GlobalPolicy):
+            self.target_switches += message.switched
+        elif isinstance(message, GlobalIrm):
+            self._graph_fits = self._mirror.apply(message)
+
+    def _note(self, topic_name: str, message: Message, now_ns: int) -> None:
+        seen = self._seen.get(topic_name)
+        if seen is None:
+            self._seen[topic_name] = _Seen(message, now_ns)
+            return
+        interval_s = (now_ns - seen.received_ns) / SECOND_NS
+        smooth = _RATE_SMOOTHING if seen.interval_s > 0 else 1.0
+        seen.interval_s += smooth * (interval_s - seen.interval_s)
+        seen.message, seen.received_ns, seen.count = message, now_ns, seen.count + 1
+
+    def _follow(self, odometry: Odometry) -> None:
+        at = _in_map(odometry.map_to_odom, odometry.pose)
+        if self._trajectory and math.dist(self._trajectory[-1], at[:2]) < self.config.trajectory_spacing_m:
+            return
+        self._trajectory.append((at.x_m, at.y_m))
+        if len(self._trajectory) > self.config.max_trajectory_points:
+            self._trajectory = self._trajectory[::2]
+
+    def graph_request(self, now_ns: int, stamp_ns: int) -> GraphRequest | None:
+        """A request for the whole Global IRM when a difference was missed, at most every `ask_again_s`."""
+        waited = self._asked_ns < 0 or now_ns - self._asked_ns >= self.config.ask_again_s * SECOND_NS
+        if self._graph_fits or not waited:
+            return None
+        self._asked_ns = now_ns
+        return GraphRequest(stamp_ns=stamp_ns, have_version=self._mirror.version)
+
+    def not_ready(self, now_ns: int) -> list[str]:
+        """Why the robot is not ready, in plain words; empty when it is."""
+        reasons = []
+        for stage in self._stages(now_ns):
+            if stage.state == "missing":
+                reasons.append(f"{stage.service}: not heard of yet")
+            elif stage.state == "silent":
+                reasons.append(f"{stage.service}: silent for {stage.age_s:.1f} s")
+            elif stage.state == "not_ready":
+                waiting = f", waiting for {', '.join(stage.waiting_for)}" if stage.waiting_for else ""
+                reasons.append(f"{stage.service}: not ready{waiting}")
+        for name in self.config.expected_topics:
+            seen, limit_ns = self._seen.get(name), topic_named(name).stale_after_ns
+            if seen is None:
+                reasons.append(f"{name}: nothing received yet")
+            elif 0 < limit_ns < now_ns - seen.received_ns:
+                reasons.append(f"{name}: nothing for {(now_ns - seen.received_ns) / SECOND_NS:.1f} s")
+        return reasons
+
+    def status(self, now_ns: int) -> StatusReport:
+        """Everything known now."""
+        reasons = self.not_ready(now_ns)
+        odometry = self._latest("sim/odometry", Odometry)
+        judge = self._latest("sim/judge", JudgeReport)
+        return StatusReport(
+            robot=self.robot,
+            ready=not reasons,
+            not_ready_because=reasons,
+            mission=self._mission(),
+            pose=self._pose(),
+            speed_mps=None if odometry is None else odometry.speed_mps,
+            coverage=self._coverage(judge),
+            target=self._target(),
+            target_switches=self.target_switches,
+            plan=self._plan(now_ns),
+            lost=None if judge is None else judge.lost,
+            stages=self._stages(now_ns),
+            topics=self._topics(now_ns),
+        )
+
+    def _latest(self, topic_name: str, kind: type[_M]) -> _M | None:
+        seen = self._seen.get(topic_name)
+        return seen.message if seen is not None and isinstance(seen.message, kind) else None
+
+    def _pose(self) -> PlaceReport | None:
+        odometry = self._latest("sim/odometry", Odometry)
+        if odometry is None:
+            return None
+        at = _in_map(odometry.map_to_odom, odometry.pose)
+        return PlaceReport(x_m=at.x_m, y_m=at.y_m, yaw_rad=at.yaw_rad)
+
+    def _mission(self) -> MissionReport | None:
+        state = self._latest("mission/state", MissionState)
+        if state is None:
+            return None
+        return MissionReport(
+            phase=state.phase.value,
+            finish=state.finish.value,
+            reason=state.reason,
+            elapsed_s=state.elapsed_s,
+            time_budget_s=state.time_budget_s,
+            distance_m=state.distance_m,
+            return_distance_m=state.return_distance_m,
+            left=len(state.left),
+        )
+
+    def _coverage(self, judge: JudgeReport | None) -> CoverageReport | None:
+        summary = self._latest("irm/coverage", CoverageSummary)
+        if summary is None:
+            return None
+        return CoverageReport(
+            belief=summary.covered_fraction,
+            covered_area_m2=summary.covered_area_m2,
+            reachable_area_m2=summary.reachable_area_m2,
+            frontiers=summary.frontiers,
+            judge=None if judge is None else judge.coverage,
+        )
+
+    def _target(self) -> TargetReport | None:
+        policy = self._latest("gcp/global_policy", GlobalPolicy)
+        if policy is None:
+            return None
+        return TargetReport(
+            id=policy.target,
+            x_m=policy.target_xyz_m[0],
+            y_m=policy.target_xyz_m[1],
+            gain=policy.target_gain,
+            distance_m=policy.target_distance_m,
+            risk=policy.target_risk,
+            q=policy.target_q,
+            reason=policy.reason,
+        )
+
+    def _plan(self, now_ns: int) -> PlanReport | None:
+        plan = self._latest("reconciler/plan", Plan)
+        if plan is None:
+            return None
+        return PlanReport(
+            safety=plan.safety.value,
+            valid=plan.valid,
+            reason=plan.reason,
+            tau_s=plan.tau_s,
+            age_s=(now_ns - self._seen["reconciler/plan"].received_ns) / SECOND_NS,
+            length_m=float(np.hypot(np.diff(plan.x_m), np.diff(plan.y_m)).sum()),
+        )
+
+    def _stages(self, now_ns: int) -> list[StageReport]:
+        heard = {name.split("/")[0] for name in self._seen if name.endswith("/health")}
+        extra = sorted(heard - set(self.config.expected_services))
+        return [self._stage(name, now_ns) for name in (*self.config.expected_services, *extra)]
+
+    def _stage(self, service: str, now_ns: int) -> StageReport:
+        topic = health_topic(service)
+        health = self._latest(topic.name, StageHealth)
+        if health is None:
+            return StageReport(service=service, state="missing")
+        age_ns = now_ns - self._seen[topic.name].received_ns
+        state = "silent" if age_ns > topic.stale_after_ns else "ok" if health.ready else "not_ready"
+        return StageReport(
+            state=state, age_s=age_ns / SECOND_NS, **health.model_dump(exclude={"stamp_ns", "ready"})
+        )
+
+    def _topics(self, now_ns: int) -> list[TopicReport]:
+        reports = []
+        for name, seen in sorted(self._seen.items()):
+            age_ns, limit_ns = now_ns - seen.received_ns, topic_named(name).stale_after_ns
+            rate_hz = 1.0 / max(seen.interval_s, age_ns / SECOND_NS) if seen.interval_s > 0 else 0.0
+            stale = 0 < limit_ns < age_ns
+            reports.append(
+                TopicReport(
+                    name=name, messages=seen.count, age_s=age_ns / SECOND_NS, rate_hz=rate_hz, stale=stale
+                )
+            )
+        return reports
+
+    def picture(self) -> Picture:
+        """What the picture of the map shows: coverage, trajectory, robot, plan, frontiers and target."""
+        place, policy = self._pose(), self._latest("gcp/global_policy", GlobalPolicy)
+        road_map = self._mirror.road_map()
+        frontiers = road_map.xyz_m[road_map.kind == FRONTIER, :2]
+        return Picture(
+            canvas=self.canvas.whole(),
+            trajectory=tuple(self._trajectory),
+            robot=None if place is None else (place.x_m, place.y_m, place.yaw_rad),
+            plan=self._plan_in_map(),
+            frontiers=tuple((float(x), float(y)) for x, y in frontiers),
+            target=None if policy is None or policy.target < 0 else policy.target_xyz_m[:2],
+            route=() if policy is None else tuple((float(x), float(y)) for x, y, _ in policy.path_xyz_m),
+            title=self._title(),
+        )
+
+    def _plan_in_map(self) -> tuple[tuple[float, float], ...]:
+        plan, odometry = self._latest("reconciler/plan", Plan), self._latest("sim/odometry", Odometry)
+        if plan is None or odometry is None or not plan.valid:
+            return ()
+        frame = _planar(odometry.map_to_odom)
+        return tuple(frame.apply(float(x), float(y)) for x, y in zip(plan.x_m, plan.y_m, strict=True))
+
+    def _title(self) -> str:
+        mission, coverage = self._mission(), self._coverage(None)
+        phase = "no mission yet" if mission is None else f"{mission.phase} {mission.elapsed_s:.0f} s"
+        return phase if coverage is None else f"{phase}, {100 * coverage.belief:.1f} % covered"
+
+    def numbers(self, now_ns: int) -> Mapping[str, float]:
+        """The numbers of the status by name, for metrics; only what is known."""
+        report = self.status(now_ns)
+        found: dict[str, float | None] = {
+            "ready": float(report.ready),
+            "target_switches": float(report.target_switches),
+        }
+        if report.coverage is not None:
+            found |= {
+                "coverage_belief": report.coverage.belief,
+                "coverage_judge": report.coverage.judge,
+                "frontiers": float(report.coverage.frontiers),
+            }
+        if report.mission is not None:
+            found |= {
+                "elapsed_seconds": report.mission.elapsed_s,
+                "distance_meters": report.mission.distance_m,
+            }
+        if report.plan is not None:
+            found |= {"plan_tau_seconds": report.plan.tau_s}
+        return {name: value for name, value in found.items() if value is not None}
+
+
+def _planar(pose: Pose) -> Planar:
+    return Planar(pose.x_m, pose.y_m, pose.yaw_rad)
+
+
+def _in_map(map_to_odom: Pose, pose: Pose) -> Planar:
+    return _planar(map_to_odom).compose(_planar(pose))

@@ -1,0 +1,121 @@
+"""The command line: exit codes, one-line errors, and the status service as `plgrim run status` runs it."""
+
+from __future__ import annotations
+
+import json
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from plgrim import cli
+from plgrim.cli import application
+from plgrim.config import Config
+from plgrim.runtime.health import ask_health
+from plgrim.runtime.zenoh_session import Link
+from plgrim.warmup import warm_ups
+from schemas.topics import TOPICS
+from tests.runtime.helpers import FAKES, Start, eventually
+
+
+def test_the_table_of_topics_names_every_topic() -> None:
+    output = CliRunner().invoke(application, ["topics"]).output
+    assert all(f"`{topic.name}`" in output for topic in TOPICS)
+    assert len({line.count("|") for line in output.splitlines()}) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["run", "nothing"], 2, "no service 'nothing'"),
+        (["explore", "--world", "maze", "--map", "x.yaml"], 2, "exclude each other"),
+        (["explore", "--config", "no/such/file.yaml"], 2, "no/such/file.yaml"),
+        (["healthcheck", "sim", "--timeout", "0.1"], 1, "no Zenoh router"),
+        (["status", "--url", "http://127.0.0.1:9"], 1, "no status at"),
+    ],
+)
+def test_errors_are_one_line_and_have_their_code(
+    config: Config, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: list[str], code: int, text: str,
+) -> None:  # fmt: skip
+    monkeypatch.setattr("sys.argv", ["plgrim", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        cli.app()
+    assert ended.value.code == code
+    captured = capsys.readouterr()
+    assert text in captured.out + captured.err
+    assert "Traceback" not in captured.err
+
+
+def test_an_unknown_key_ends_a_mission_before_it_starts(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("mission: {time_budgets: 3}\n", encoding="utf-8")
+    monkeypatch.setattr("sys.argv", ["plgrim", "up", "-c", str(file), "-o", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as ended:
+        cli.app()
+    assert ended.value.code == 2
+    assert "'mission.time_budgets': did you mean 'time_budget_s'?" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def _json(address: str) -> dict[str, object]:
+    try:
+        with urllib.request.urlopen(address, timeout=10.0) as response:
+            content: dict[str, object] = json.load(response)
+    except urllib.error.HTTPError as error:
+        content = json.load(error)
+        error.close()
+    return content
+
+
+def test_the_status_service_answers_over_http_and_over_zenoh(
+    link: Link, start: Start, free_port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PLGRIM_STATUS__PORT", str(free_port))
+    status = start("-m", "plgrim", "run", "status")
+    start(str(FAKES), "sim")
+    start(str(FAKES), "mission")
+
+    def is_ready() -> bool:
+        health = ask_health(link, "status", 1.0)
+        return health is not None and health.ready and health.pid == status.pid
+
+    eventually(is_ready, "the status service is ready")
+    page = f"http://127.0.0.1:{free_port}"
+    assert _json(f"{page}/healthz") == {"status": "ok"}
+
+    def phase() -> object:
+        mission = _json(f"{page}/api/v1/status").get("mission")
+        return mission.get("phase") if isinstance(mission, dict) else None
+
+    eventually(lambda: phase() == "explore", "the mission's state has come through")
+    reasons = _json(f"{page}/readyz")["reasons"]
+    assert isinstance(reasons, list)
+    assert any("gcp" in reason for reason in reasons)
+    assert CliRunner().invoke(application, ["healthcheck", "status"]).exit_code == 0
+    assert CliRunner().invoke(application, ["healthcheck", "mission"]).exit_code == 0
+    assert CliRunner().invoke(application, ["healthcheck", "router"]).exit_code == 0
+    assert CliRunner().invoke(application, ["healthcheck", "gcp"]).exit_code == 1
+    second = start("-m", "plgrim", "run", "status")
+    output, _ = second.communicate(timeout=60)
+    assert second.returncode == 4
+    assert f"{free_port}" in output
+    assert "PLGRIM_STATUS__PORT" in output
+    status.terminate()
+    status.wait(timeout=60)
+    assert status.returncode == 0
+
+
+def test_the_router_refuses_a_taken_port(router: None, start: Start) -> None:
+    process = start("-m", "plgrim", "router")
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == 4
+    assert "PLGRIM_ROUTER" in output
+
+
+def test_every_stage_with_kernels_says_how_to_compile_them() -> None:
+    assert all(callable(warm_up) for warm_up in warm_ups().values())

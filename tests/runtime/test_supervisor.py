@@ -1,0 +1,188 @@
+"""The supervisor with fake services: starts, restarts, gives up, leaves nobody behind; and a whole mission's result."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import threading
+from pathlib import Path
+
+import psutil
+import pytest
+from rich.console import Console
+
+from plgrim.config import Config
+from plgrim.errors import PortTakenError, ServiceFailedError
+from plgrim.missions import run_live
+from plgrim.runtime.process import THREAD_LIMITS, child_environment
+from plgrim.runtime.router import check_endpoint_free, host_and_port
+from plgrim.runtime.supervisor import Supervisor
+from tests.runtime.helpers import FAKES, Start, eventually, fake_command
+
+SERVICES = ("sim", "mission")
+
+
+def _supervisor(config: Config, folder: Path, behaviours: dict[str, str] | None = None) -> Supervisor:
+    return Supervisor(config, folder, SERVICES, fake_command(behaviours or {}))
+
+
+def _pids(supervisor: Supervisor) -> list[int]:
+    return [child.process.pid for child in supervisor.children.values() if child.process]
+
+
+def _gone(pid: int) -> bool:
+    return not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+
+
+def test_all_become_ready_and_all_end(config: Config, tmp_path: Path) -> None:
+    waited: list[list[str]] = []
+    with _supervisor(config, tmp_path) as supervisor:
+        supervisor.start()
+        assert supervisor.wait_ready(threading.Event(), waited.append)
+        pids = _pids(supervisor)
+        assert len(pids) == 3
+    assert all(_gone(pid) for pid in pids)
+    assert waited[-1] == []
+    assert "ready" in (tmp_path / "logs" / "sim.log").read_text(encoding="utf-8")
+    check_endpoint_free(config.router.endpoint)
+
+
+def test_a_killed_service_comes_back(config: Config, tmp_path: Path) -> None:
+    with _supervisor(config, tmp_path) as supervisor:
+        supervisor.start()
+        supervisor.wait_ready(threading.Event())
+        sim = supervisor.children["sim"]
+        assert sim.process is not None
+        killed = sim.process.pid
+        os.kill(killed, signal.SIGKILL)
+
+        def is_back() -> bool:
+            supervisor.poll()
+            return sim.process is not None and sim.process.pid != killed and sim.ready
+
+        eventually(is_back, "the service is ready again")
+        assert sim.restarted == 1
+
+
+def test_a_killed_router_comes_back_and_the_services_find_it(config: Config, tmp_path: Path) -> None:
+    with _supervisor(config, tmp_path) as supervisor:
+        supervisor.start()
+        supervisor.wait_ready(threading.Event())
+        router, sim = supervisor.children["router"], supervisor.children["sim"]
+        assert router.process is not None
+        os.kill(router.process.pid, signal.SIGKILL)
+        eventually(lambda: supervisor.poll() or (router.restarted and router.process), "the router is back")
+        steps = sim.health.steps if sim.health else 0
+
+        def goes_on() -> bool:
+            supervisor.poll()
+            return sim.health is not None and sim.health.steps > steps + 20
+
+        eventually(goes_on, "health comes through the new router")
+        assert sim.restarted == 0
+
+
+@pytest.mark.parametrize("behaviour", ["exits", "failing"])
+def test_a_service_that_keeps_crashing_ends_the_run(config: Config, tmp_path: Path, behaviour: str) -> None:
+    with _supervisor(config, tmp_path, {"mission": behaviour}) as supervisor:
+        supervisor.start()
+
+        def polled() -> None:
+            supervisor.poll()
+
+        with pytest.raises(ServiceFailedError, match="mission ended with .* after 2 restarts"):
+            eventually(polled, "the supervisor gives up")
+        pids = _pids(supervisor)
+    assert all(_gone(pid) for pid in pids)
+
+
+def test_a_silent_service_is_killed_and_restarted(config: Config, tmp_path: Path) -> None:
+    runtime = config.runtime.model_copy(update={"unresponsive_after_s": 1.0})
+    config = config.model_copy(update={"runtime": runtime})
+    with _supervisor(config, tmp_path) as supervisor:
+        supervisor.start()
+        supervisor.wait_ready(threading.Event())
+        sim = supervisor.children["sim"]
+        assert sim.process is not None
+        os.kill(sim.process.pid, signal.SIGSTOP)
+        eventually(lambda: supervisor.poll() or (sim.restarted == 1 and sim.ready), "it was replaced")
+
+
+def test_a_second_instance_is_not_restarted_but_told(config: Config, tmp_path: Path) -> None:
+    (tmp_path / "second").mkdir()
+    with _supervisor(config, tmp_path) as supervisor:
+        supervisor.start()
+        supervisor.wait_ready(threading.Event())
+        child = supervisor.children["sim"]
+        first = child.process
+        supervisor._spawn(child)
+
+        def polled() -> None:
+            supervisor.poll()
+
+        with pytest.raises(ServiceFailedError, match="already running"):
+            eventually(polled, "the second one is refused")
+        child.process = first
+
+
+def test_a_taken_port_is_named_with_the_mend(config: Config, tmp_path: Path) -> None:
+    place = host_and_port(config.router.endpoint)
+    assert place is not None
+    with socket.create_server(place), _supervisor(config, tmp_path) as supervisor:
+        with pytest.raises(PortTakenError, match=f"port {place[1]} .*PLGRIM_ROUTER"):
+            supervisor.start()
+        assert _pids(supervisor) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_no_orphans_however_the_supervisor_ends(
+    config: Config, tmp_path: Path, start: Start, number: signal.Signals
+) -> None:
+    process = start(str(FAKES.with_name("fake_supervisor.py")), str(tmp_path))
+    pids = tmp_path / "pids.json"
+    eventually(lambda: pids.exists() or process.poll() is not None, "the children are ready")
+    children = json.loads(pids.read_text(encoding="utf-8"))
+    assert len(children) == 3
+    assert not any(_gone(pid) for pid in children)
+    process.send_signal(number)
+    process.wait(timeout=60)
+    eventually(lambda: all(_gone(pid) for pid in children), "no child is left")
+
+
+def test_a_mission_to_its_end_gives_a_result(config: Config, tmp_path: Path) -> None:
+    result = run_live(
+        config,
+        tmp_path,
+        threading.Event(),
+        Console(quiet=True),
+        services=SERVICES,
+        command=fake_command({"mission": "ends"}),
+    )
+    assert result["succeeded"] is True
+    assert result["finish"] == "covered"
+    assert result["coverage_judge"] == 0.99
+    assert result["stages"]["sim"]["steps"] > 10
+    assert result["stages"]["mission"]["errors"] == 0
+    for name in ("result.json", "trajectory.csv", "coverage.png", "map.png", "config.yaml"):
+        assert (tmp_path / name).stat().st_size > 0
+    assert json.loads((tmp_path / "result.json").read_text(encoding="utf-8")) == result
+
+
+def test_a_stop_before_the_end_gives_a_result_that_says_so(config: Config, tmp_path: Path) -> None:
+    stop = threading.Event()
+    stop.set()
+    result = run_live(
+        config, tmp_path, stop, Console(quiet=True), services=SERVICES, command=fake_command({})
+    )
+    assert result["succeeded"] is False
+    assert result["finish"] == ""
+    assert (tmp_path / "result.json").exists()
+
+
+def test_children_compute_on_one_thread_and_know_their_parent() -> None:
+    environment = child_environment({"PATH": "/bin", "OMP_NUM_THREADS": "3"})
+    assert environment["PLGRIM_PARENT_PID"] == str(os.getpid())
+    assert environment["NUMBA_NUM_THREADS"] == THREAD_LIMITS["NUMBA_NUM_THREADS"] == "1"
+    assert environment["OMP_NUM_THREADS"] == "3"
