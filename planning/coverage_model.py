@@ -263,7 +263,7 @@ def _rollout(model: CoverageModel, state: NDArray[np.int64], depth_left: int, rn
     for _ in range(model.rollout_steps if depth_left > 0 else 0):
         k = -1
         if random_uniform(rng) < model.rollout_random:
-            k = random_below(rng, 8)
+            k = np.int64(random_below(rng, 8))
             if model.edge_distance_m[state[NODE], k] <= 0.0 or model.edge_risk[state[NODE], k] > 0.1:
                 k = -1
         if k < 0:

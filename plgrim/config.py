@@ -47,8 +47,8 @@ class RouterConfig(_Section):
 
     @property
     def client_endpoint(self) -> str:
-        """The endpoint that a client connects to."""
-        return self.connect or self.endpoint
+        """The endpoint that a client connects to; a router that listens everywhere is reached on this host."""
+        return self.connect or self.endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
 
 
 class ClockConfig(_Section):
@@ -59,7 +59,7 @@ class ClockConfig(_Section):
     origin_ns: int = Field(0, ge=0)
     """Reading of `source` at mission clock 0, ns."""
     source: Literal["monotonic", "realtime"] = "monotonic"
-    """monotonic: one host (shared by all its processes and containers). realtime: hosts whose clocks are synchronised."""
+    """monotonic: one host, shared by its processes and containers. realtime: several hosts with synchronised clocks."""
 
 
 class RuntimeConfig(_Section):

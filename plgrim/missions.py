@@ -51,7 +51,7 @@ def status_address(config: Config) -> tuple[str, int]:
 def status_page(config: Config) -> str:
     """Address of the status page as a person on this host opens it."""
     host, port = status_address(config)
-    return f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else host}:{port}/"  # noqa: S104
+    return f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else host}:{port}/"
 
 
 def attach_recorder(link: Link, recorder: MissionRecorder) -> None:

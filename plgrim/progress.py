@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
@@ -92,7 +92,11 @@ class MissionProgress:
             return Group(Text(self._note))
         coverage = self._recorder.coverage
         bar = ProgressBar(total=1.0, completed=coverage.covered_fraction if coverage else 0.0, width=60)
-        lines = [Text(progress_text(self._recorder)), bar, Text(target_text(self._recorder))]
+        lines: list[RenderableType] = [
+            Text(progress_text(self._recorder)),
+            bar,
+            Text(target_text(self._recorder)),
+        ]
         if self._page:
             lines.append(Text(f"status  {self._page}", style="dim"))
         return Group(*lines)
@@ -103,6 +107,7 @@ def summary_table(result: Mapping[str, Any]) -> Table:
     table = Table(title=f"mission in {result['world']}, seed {result['seed']}", show_header=False)
     switches = result["target_switches_per_100m"]
     latency = result["cloud_to_plan"]
+    p50, p95 = (_number(latency[name], "s", 2) for name in ("p50_mission_s", "p95_mission_s"))
     rows: list[tuple[str, str]] = [
         ("finish", f"{result['finish'] or 'not finished'}: {result['finish_text']}"),
         ("coverage by the judge", _percent(result["coverage_judge"])),
@@ -112,7 +117,7 @@ def summary_table(result: Mapping[str, Any]) -> Table:
         ("target switches", f"{result['target_switches']} ({_number(switches, 'per 100 m', 2)})"),
         ("lost", f"{result['lost']} {result['lost_reason']}".strip()),
         ("contacts", str(result["contacts"])),
-        ("cloud to plan", f"p50 {_number(latency['p50_mission_s'], 's', 2)}, p95 {_number(latency['p95_mission_s'], 's', 2)}"),
+        ("cloud to plan", f"p50 {p50}, p95 {p95} of mission time"),
     ]  # fmt: skip
     if "times_real_time" in result:
         rows.append(("speed", f"{result['times_real_time']:.1f} times real time"))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
+from plgrim.errors import ConfigError
 from schemas.contract import Stage, StageSetup, StageSpec
 
 STAGES = ("riskmap", "irm", "gcp", "lcp", "reconciler", "mission", "sim")
@@ -25,3 +27,22 @@ def make_stage(name: str, options: Mapping[str, Any], setup: StageSetup) -> tupl
     config = module.Config.model_validate(dict(options))
     stage: Stage = module.create(config, setup)
     return module.spec(config), stage
+
+
+@contextmanager
+def world_errors(name: str) -> Iterator[None]:
+    """A world that cannot be built is the user's to mend: ConfigError, which no supervisor restarts."""
+    if name != "sim":
+        yield
+        return
+    worlds = importlib.import_module("services.sim.worlds")
+    try:
+        yield
+    except worlds.WorldError as error:
+        raise ConfigError(f"sim: {error}") from error
+
+
+def check_world(config: Any) -> None:
+    """Build the simulator's world once from its `Config`, to learn whether it can be. Raises ConfigError."""
+    with world_errors("sim"):
+        importlib.import_module("services.sim.worlds").build_world(config)

@@ -79,18 +79,21 @@ def watch(out: OutFolder = Path("out/watch"), config_file: ConfigFile = None) ->
 
     die_with_parent()
     configure_logs("watch")
-    config = _prepare(config_file, {})
+    config = _prepare(config_file, {}, with_world=False)
     with stop_on_signals() as stop:
         result = watch_mission(config, out, stop, _console())
     _finish(result, out)
 
 
-def _prepare(config_file: Path | None, overrides: dict[str, Any]) -> Config:
-    """The whole configuration, every section checked: before anything starts."""
-    from plgrim.config import check_all, load_config
+def _prepare(config_file: Path | None, overrides: dict[str, Any], with_world: bool = True) -> Config:
+    """The whole configuration, every section checked, and the world built once: before anything starts."""
+    from plgrim.config import check_all, check_service, load_config
+    from plgrim.registry import check_world
 
     config = load_config(config_file, overrides)
     check_all(config)
+    if with_world and (options := check_service(config, "sim")) is not None:
+        check_world(options)
     return config
 
 

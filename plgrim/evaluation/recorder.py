@@ -166,6 +166,7 @@ class MissionRecorder:
             mission, judge, coverage = self.mission, self.judge, self.coverage
             return {
                 **self._about,
+                **({"world": judge.world} if judge else {}),
                 "finish": mission.finish.value if mission else "",
                 "finish_text": mission.reason if mission else "no mission state was seen",
                 "succeeded": self.succeeded,

@@ -14,7 +14,7 @@ import zenoh
 from plgrim.config import Config, check_service
 from plgrim.errors import ServiceFailedError
 from plgrim.logs import get_logger
-from plgrim.registry import stage_module
+from plgrim.registry import stage_module, world_errors
 from plgrim.runtime.mailbox import Mailbox, Outbox
 from plgrim.runtime.process import Interrupted, interruptible
 from plgrim.runtime.service import LiveService
@@ -35,7 +35,8 @@ def run_stage(name: str, config: Config, stop: threading.Event) -> None:
     def make() -> tuple[StageSpec, Stage]:
         if hasattr(module, "warm_up"):
             module.warm_up()
-        stage: Stage = module.create(options, StageSetup(config.robot, config.seed))
+        with world_errors(name):
+            stage: Stage = module.create(options, StageSetup(config.robot, config.seed))
         return module.spec(options), stage
 
     drive(name, config, make, stop)

@@ -42,7 +42,7 @@ def child_environment(environment: Mapping[str, str]) -> dict[str, str]:
     return {**THREAD_LIMITS, **environment, PARENT_VARIABLE: str(os.getpid())}
 
 
-class Interrupted(BaseException):  # noqa: N818 - like KeyboardInterrupt, no error
+class Interrupted(BaseException):
     """A signal came while the main thread was in code that does not look at the stop event."""
 
 

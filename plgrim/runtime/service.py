@@ -14,7 +14,7 @@ from plgrim.config import Config
 from plgrim.errors import AlreadyRunningError
 from plgrim.logs import get_logger
 from plgrim.runtime.clock import MissionClock
-from plgrim.runtime.health import Heartbeat, HealthMonitor, query_key, token_key
+from plgrim.runtime.health import HealthMonitor, Heartbeat, query_key, token_key
 from plgrim.runtime.mailbox import Outbox
 from plgrim.runtime.zenoh_session import Link, connect
 from schemas.contract import Output, Stamp

@@ -26,6 +26,8 @@ from schemas.contract import SECOND_NS, Topic
 
 _FIFO = 1024
 _KEEP_ALL_CACHE = 64
+_LARGE_CACHE = 8
+_LARGE_BYTES = 1024 * 1024
 _OPEN_TIMEOUT_MS = 2000
 Receive = Callable[[Topic[Message], bytes], None]
 
@@ -103,6 +105,13 @@ def is_latched(topic: Topic[Message]) -> bool:
     return topic.period_ns >= SECOND_NS // 2 and topic.stale_after_ns == 0
 
 
+def _cached(topic: Topic[Message]) -> int:
+    """Samples that a publisher keeps for late joiners and for readers that missed some."""
+    if not topic.keep_all:
+        return 1
+    return _LARGE_CACHE if topic.max_bytes > _LARGE_BYTES else _KEEP_ALL_CACHE
+
+
 def _is_advanced(topic: Topic[Message]) -> bool:
     return topic.keep_all or is_latched(topic)
 
@@ -158,7 +167,7 @@ class Link:
         return ext.declare_advanced_publisher(
             self.session,
             key,
-            cache=ext.CacheConfig(max_samples=_KEEP_ALL_CACHE if topic.keep_all else 1),
+            cache=ext.CacheConfig(max_samples=_cached(topic)),
             publisher_detection=True,
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             **qos,
@@ -183,8 +192,7 @@ class Link:
             return self.session.declare_subscriber(key, channel)
         history: dict[str, Any] = {}
         if topic.period_ns > 0:
-            samples = _KEEP_ALL_CACHE if topic.keep_all else 1
-            history["history"] = ext.HistoryConfig(detect_late_publishers=True, max_samples=samples)
+            history["history"] = ext.HistoryConfig(detect_late_publishers=True, max_samples=_cached(topic))
         return ext.declare_advanced_subscriber(
             self.session,
             key,
@@ -235,7 +243,7 @@ def _drain(handler: Any, work: Callable[[Any], None], name: str) -> None:
 
 
 def _priority(topic: Topic[Message]) -> zenoh.Priority:
-    if topic.max_bytes > 1024 * 1024:
+    if topic.max_bytes > _LARGE_BYTES:
         return zenoh.Priority.DATA_LOW
     if topic.name in ("reconciler/plan", "status/command", "mission/state"):
         return zenoh.Priority.INTERACTIVE_HIGH

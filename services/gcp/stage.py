@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from planning.frames import Planar
-from planning.graph_mirror import GraphMirror
+from planning.graph_mirror import GraphMirror, RoadMap
 from planning.randomness import stream
+from planning.reward import RewardWeights
 from schemas.contract import SECOND_NS, Inputs, Outputs, Stage, StageSetup, StageSpec, Stamp, outputs
 from schemas.operation import MissionPhase, MissionState
 from schemas.policy import Alternative, GlobalPolicy
@@ -19,7 +20,7 @@ from schemas.world import GraphRequest
 from services.gcp.config import Config
 from services.gcp.planner import Belief, Floats, GlobalPlanner, Option, Values
 
-__all__ = ["Config", "GcpStage", "create", "spec"]
+__all__ = ["Config", "GcpStage", "create", "spec", "warm_up"]
 
 _OVER = (MissionPhase.DONE, MissionPhase.STOPPED)
 
@@ -257,3 +258,25 @@ def _alternative(planner: GlobalPlanner, option: Option) -> Alternative:
         risk=option.risk,
         q=option.q,
     )
+
+
+def warm_up() -> None:
+    """Compile the kernels: one breadcrumb, one frontier, one edge."""
+    two, both = np.zeros(2), np.array([1, 0], np.int32)
+    road_map = RoadMap(
+        np.arange(2),
+        np.array([0, 1], np.uint8),
+        np.zeros((2, 3)),
+        two,
+        two.astype(np.float32),
+        np.array([0, 1, 2], np.int32),
+        both,
+        two,
+        two,
+        two.astype(np.uint8),
+    )
+    planner = GlobalPlanner(road_map, RewardWeights())
+    planner.options(Belief(np.zeros((1, 3)), 0), [], 1)
+    planner.values()
+    planner.values_to_go(np.zeros(3), 1.0)
+    planner.way_home(0, 0)

@@ -18,7 +18,7 @@ from schemas.world import CoverageSummary, GraphRequest
 from services.mission.config import Config
 from services.mission.machine import Facts, Machine
 
-__all__ = ["Config", "MissionStage", "create", "spec"]
+__all__ = ["Config", "MissionStage", "create", "spec", "warm_up"]
 
 _MAX_JUMP_M = 2.0  # between two steps; more is an odometry fault, not travel
 
@@ -215,3 +215,20 @@ def _unreachable(coverage: CoverageSummary) -> list[LeftOver]:
             coverage.unreachable_xy_m, coverage.unreachable_gain, reasons, strict=False
         )
     ]
+
+
+def warm_up() -> None:
+    """Compile the kernels."""
+    one = np.zeros(1)
+    RoadMap(
+        np.zeros(1, np.int64),
+        np.zeros(1, np.uint8),
+        np.zeros((1, 3)),
+        one,
+        np.zeros(1, np.float32),
+        np.zeros(2, np.int32),
+        np.zeros(0, np.int32),
+        one[:0],
+        one[:0],
+        np.zeros(0, np.uint8),
+    ).travel_from(0)

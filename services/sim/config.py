@@ -12,7 +12,7 @@ Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
 _PROFILES: dict[str, dict[str, float]] = {
     "husky": {"footprint_radius_m": 0.335, "max_speed_mps": 1.0, "height_m": 0.9},
-    "spot": {"footprint_radius_m": 0.25, "max_speed_mps": 1.2, "height_m": 0.9},
+    "spot": {"footprint_radius_m": 0.25, "max_speed_mps": 1.0, "height_m": 0.9},
 }
 
 
@@ -23,7 +23,7 @@ class _Model(BaseModel):
 class LidarConfig(_Model):
     """A spinning LiDAR: `rings` elevations, evenly spaced with both ends, times `azimuths` directions."""
 
-    range_m: Positive = 20.0
+    range_m: float = Field(default=20.0, gt=0.0, le=1000.0)
     """Longest slant range that returns."""
     rings: int = Field(default=16, ge=1, le=128)
     azimuths: int = Field(default=900, ge=4, le=4096)
@@ -50,7 +50,7 @@ class LidarConfig(_Model):
 class CoverageSensorConfig(_Model):
     """The sensor that covers ground (a camera, say): a sector ahead of the robot, cut by walls."""
 
-    range_m: Positive = 6.0
+    range_m: float = Field(default=6.0, gt=0.0, le=100.0)
     fov_deg: float = Field(default=120.0, gt=0.0, le=360.0)
     """Whole opening angle, centred on the robot's heading."""
     rate_hz: Positive = 10.0
@@ -61,12 +61,12 @@ class CoverageSensorConfig(_Model):
 class RobotConfig(_Model):
     """A ground robot with a disc for a footprint. `profile` sets the defaults of the other fields."""
 
-    profile: Literal["husky", "spot"] = "husky"
-    footprint_radius_m: Positive = 0.335
+    profile: Literal["husky", "spot"] = "spot"
+    footprint_radius_m: Positive = 0.25
     """Half the robot's width: Husky 0.335 m, Spot 0.25 m."""
-    max_speed_mps: Positive = 1.0
+    max_speed_mps: float = Field(default=1.0, gt=0.0, le=20.0)
     max_acceleration_mps2: Positive = 1.0
-    max_turn_rate_radps: Positive = 1.5
+    max_turn_rate_radps: float = Field(default=1.5, gt=0.0, le=20.0)
     max_turn_acceleration_radps2: Positive = 3.0
     height_m: Positive = 0.9
 
@@ -74,7 +74,7 @@ class RobotConfig(_Model):
     @classmethod
     def _fill_from_profile(cls, data: Any) -> Any:
         if isinstance(data, dict):
-            return {**_PROFILES.get(str(data.get("profile", "husky")), {}), **data}
+            return {**_PROFILES.get(str(data.get("profile", "spot")), {}), **data}
         return data
 
 
@@ -86,7 +86,7 @@ class SlamConfig(_Model):
     yaw_noise_rad: NotNegative = 0.002
     """Standard deviation of the yaw."""
     keyframe_spacing_m: Positive = 1.0
-    """Distance driven between keyframes."""
+    """A keyframe is added at this distance from the last one."""
 
 
 class Start(_Model):
@@ -99,14 +99,14 @@ class Start(_Model):
 
 
 class SimConfig(_Model):
-    """Everything the simulator needs; together with the code it fixes every byte of a run."""
+    """Everything the simulator needs; with the code and the mission's seed it fixes every byte of a run."""
 
     world: str = "subway_1x"
     """Name of a built-in world (see `worlds.WORLD_NAMES`); not used when `map_file` is given."""
     map_file: str | None = None
     """Path of a ROS map_server YAML file."""
     seed: int = Field(default=0, ge=0, lt=2**63)
-    """Of the built-in world and of every noise."""
+    """Of the built-in world; noise comes from the seed of the mission."""
     start: Start | None = None
     """None: the world's own start."""
     robot: RobotConfig = RobotConfig()

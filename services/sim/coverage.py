@@ -35,8 +35,8 @@ class Judge:
     """
 
     def __init__(self, world: World, footprint_radius_m: float, sensor: CoverageSensorConfig) -> None:
-        self.spec, self._occupied = refine(world)
-        self.reachable = reachable_ground(self.spec, self._occupied, world.start, footprint_radius_m)
+        self.spec, self.occupied = refine(world)
+        self.reachable = reachable_ground(self.spec, self.occupied, world.start, footprint_radius_m)
         """bool[height, width] on `spec`: ground that the footprint can sweep over."""
         self.covered = np.zeros(self.spec.shape, dtype=np.bool_)
         """bool[height, width] on `spec`: reachable ground seen so far."""
@@ -52,7 +52,7 @@ class Judge:
         cell = self.spec.resolution_m
         x, y = x_m / cell - self.spec.ix0, y_m / cell - self.spec.iy0
         view = np.array([x, y, math.cos(yaw_rad), math.sin(yaw_rad)])
-        new = look(self._occupied, self._pending, self.covered, view, self._range_cells, self._cos_half_fov)
+        new = look(self.occupied, self._pending, self.covered, view, self._range_cells, self._cos_half_fov)
         self._covered_cells += new
         return new
 

@@ -130,6 +130,11 @@ class Follower:
         self._profile = None
         self.state = FollowerState(anchor=self.state.anchor, anchor_s=self.state.anchor_s)
 
+    def refresh(self, issued_s: float, ttl_s: float) -> None:
+        """The path was sent again: it lives longer, and progress along it stays. Without a path nothing happens."""
+        if self.path is not None:
+            self.path = replace(self.path, issued_s=issued_s, ttl_s=ttl_s)
+
     def step(self, x_m: float, y_m: float, yaw_rad: float, now_s: float, blocked: bool = False) -> Command:
         """Command for the pose at `now_s`."""
         if self.path is None:

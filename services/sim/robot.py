@@ -53,7 +53,9 @@ class Robot:
     """
 
     def __init__(self, world: World, config: SimConfig, rng: np.random.Generator) -> None:
-        self._world, self._rng = world, rng
+        self._world = world
+        self.rng = rng
+        """Of the slip; a driver may give another for every step."""
         self._parameters = _kernel_parameters(world, config)
         self._robot: RobotConfig = config.robot
         x_m, y_m, yaw_rad = world.start
@@ -73,7 +75,7 @@ class Robot:
         state = np.array(self.state, dtype=np.float64)
         drive(
             self._world.occupied, state, command, duration_s / substeps,
-            self._rng.standard_normal((substeps, 2)), self._parameters,
+            self.rng.standard_normal((substeps, 2)), self._parameters,
         )  # fmt: skip
         x, y, yaw, speed, turn_rate, slip, slip_turn, blocked, touching, contacts, lost = state.tolist()
         self.state = RobotState(

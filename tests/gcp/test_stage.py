@@ -16,7 +16,8 @@ from schemas.policy import GlobalPolicy
 from schemas.sensing import Odometry
 from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION, ODOMETRY
 from schemas.world import GlobalIrm
-from services.gcp.stage import Config, GcpStage, spec
+from services.gcp import alternatives, qmdp
+from services.gcp.stage import Config, GcpStage, spec, warm_up
 
 Node = tuple[int, float, float, float]  # kind, x, y, gain
 Edge = tuple[float, float]  # distance, risk
@@ -323,3 +324,15 @@ def test_spec_and_unknown_keys() -> None:
     for wrong in ({"gama": 1}, {"reward": {"k_typo": 1.0}}):
         with pytest.raises(ValueError, match="extra"):
             Config.model_validate(wrong)
+
+
+def test_warm_up_compiles_what_a_step_uses() -> None:
+    """After it a step compiles nothing: the kernels get no new signatures."""
+    warm_up()
+    kernels = [k for m in (qmdp, alternatives) for k in vars(m).values() if hasattr(k, "signatures")]
+    before = [len(kernel.signatures) for kernel in kernels]
+    bench = Bench()
+    bench.step((GLOBAL_IRM, fork()))
+    bench.step((MISSION, mission(MissionPhase.RETURN)))
+    assert len(kernels) > 5
+    assert [len(kernel.signatures) for kernel in kernels] == before

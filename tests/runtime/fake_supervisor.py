@@ -15,7 +15,10 @@ from tests.runtime.helpers import fake_command
 def main() -> None:
     """Supervise until a signal."""
     folder = Path(sys.argv[1])
-    with stop_on_signals() as stop, Supervisor(load_config(), folder, ("sim", "mission"), fake_command({})) as up:
+    with (
+        stop_on_signals() as stop,
+        Supervisor(load_config(), folder, ("sim", "mission"), fake_command({})) as up,
+    ):
         up.start()
         up.wait_ready(stop)
         pids = [child.process.pid for child in up.children.values() if child.process]

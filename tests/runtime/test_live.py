@@ -20,7 +20,7 @@ from plgrim.runtime.service import LiveService
 from plgrim.runtime.zenoh_session import Link, connect
 from schemas.base import Message
 from schemas.codec import Envelope, decode, encode
-from schemas.contract import SECOND_NS, StageSpec, Topic
+from schemas.contract import SECOND_NS, Inputs, Output, Outputs, StageSpec, Stamp, Topic
 from schemas.operation import FinishReason, MissionState, StageHealth, WorldPicture
 from schemas.topics import MISSION, ODOMETRY, PLAN, WORLD_PICTURE, health_topic, read_by
 from tests.runtime.fake_services import FakeMission, mission_state, odometry
@@ -44,10 +44,6 @@ class _Heard:
     def last(self, topic: Topic[Message]) -> Message | None:
         """The newest message of a topic."""
         return self.messages[topic.name][-1] if self.messages[topic.name] else None
-
-
-def _fake(start: Start, name: str, behaviour: str = "") -> object:
-    return start(str(FAKES), name, behaviour)
 
 
 def _health(link: Link, service: str) -> StageHealth | None:
@@ -188,7 +184,9 @@ def test_a_late_joiner_gets_what_is_rare_and_nothing_that_goes_stale(link: Link,
     with connect(config.router, config.robot, threading.Event(), 20.0) as late:
         heard = _Heard(late, WORLD_PICTURE, ODOMETRY)
         eventually(lambda: heard.last(WORLD_PICTURE), "the picture from before came")
-        eventually(lambda: link.publish(ODOMETRY, _payload(2)) or heard.last(ODOMETRY), "new odometry comes")
+        eventually(
+            lambda: heard.last(ODOMETRY), "new odometry comes", lambda: link.publish(ODOMETRY, _payload(2))
+        )
         assert {envelope.sequence for envelope in heard.envelopes[ODOMETRY.name]} == {2}
 
 
@@ -200,7 +198,7 @@ class _Recorder(FakeMission):
         self.entered, self.go = threading.Event(), threading.Event()
         self.seen: list[list[int]] = []
 
-    def step(self, now, inputs):  # type: ignore[no-untyped-def]
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """Note the sequences that are new."""
         self.seen.append([one.sequence for one in inputs.new(ODOMETRY)])
         if self.seen[-1]:
@@ -217,9 +215,7 @@ def test_what_arrives_during_a_step_is_fresh_in_the_next(link: Link, config: Con
         thread.start()
         try:
             eventually(lambda: service.monitor.ready, "the driver is ready")
-            eventually(
-                lambda: link.publish(ODOMETRY, _payload(1)) or stage.entered.wait(0.1), "the first step"
-            )
+            eventually(stage.entered.is_set, "the first step", lambda: link.publish(ODOMETRY, _payload(1)))
             link.publish(ODOMETRY, _payload(2))
             eventually(lambda: driver._mailbox._held[ODOMETRY.name][-1].envelope.sequence == 2, "it is there")
             stage.go.set()
@@ -232,9 +228,7 @@ def test_what_arrives_during_a_step_is_fresh_in_the_next(link: Link, config: Con
 
 def test_a_stage_cannot_write_what_belongs_to_another(config: Config, router: None) -> None:
     class Thief(FakeMission):
-        def step(self, now, inputs):  # type: ignore[no-untyped-def]
-            from schemas.contract import Output
-
+        def step(self, now: Stamp, inputs: Inputs) -> Outputs:
             return [Output(ODOMETRY, odometry(now, 0.0))]
 
     with LiveService("mission", config, threading.Event()) as service:

@@ -59,10 +59,9 @@ def test_a_killed_service_comes_back(config: Config, tmp_path: Path) -> None:
         os.kill(killed, signal.SIGKILL)
 
         def is_back() -> bool:
-            supervisor.poll()
             return sim.process is not None and sim.process.pid != killed and sim.ready
 
-        eventually(is_back, "the service is ready again")
+        eventually(is_back, "the service is ready again", supervisor.poll)
         assert sim.restarted == 1
 
 
@@ -73,14 +72,13 @@ def test_a_killed_router_comes_back_and_the_services_find_it(config: Config, tmp
         router, sim = supervisor.children["router"], supervisor.children["sim"]
         assert router.process is not None
         os.kill(router.process.pid, signal.SIGKILL)
-        eventually(lambda: supervisor.poll() or (router.restarted and router.process), "the router is back")
+        eventually(lambda: router.restarted and router.process, "the router is back", supervisor.poll)
         steps = sim.health.steps if sim.health else 0
 
         def goes_on() -> bool:
-            supervisor.poll()
             return sim.health is not None and sim.health.steps > steps + 20
 
-        eventually(goes_on, "health comes through the new router")
+        eventually(goes_on, "health comes through the new router", supervisor.poll)
         assert sim.restarted == 0
 
 
@@ -89,11 +87,8 @@ def test_a_service_that_keeps_crashing_ends_the_run(config: Config, tmp_path: Pa
     with _supervisor(config, tmp_path, {"mission": behaviour}) as supervisor:
         supervisor.start()
 
-        def polled() -> None:
-            supervisor.poll()
-
-        with pytest.raises(ServiceFailedError, match="mission ended with .* after 2 restarts"):
-            eventually(polled, "the supervisor gives up")
+        with pytest.raises(ServiceFailedError, match=r"mission ended with .* after 2 restarts"):
+            eventually(lambda: False, "the supervisor gives up", supervisor.poll)
         pids = _pids(supervisor)
     assert all(_gone(pid) for pid in pids)
 
@@ -107,7 +102,7 @@ def test_a_silent_service_is_killed_and_restarted(config: Config, tmp_path: Path
         sim = supervisor.children["sim"]
         assert sim.process is not None
         os.kill(sim.process.pid, signal.SIGSTOP)
-        eventually(lambda: supervisor.poll() or (sim.restarted == 1 and sim.ready), "it was replaced")
+        eventually(lambda: sim.restarted == 1 and sim.ready, "it was replaced", supervisor.poll)
 
 
 def test_a_second_instance_is_not_restarted_but_told(config: Config, tmp_path: Path) -> None:
@@ -119,11 +114,8 @@ def test_a_second_instance_is_not_restarted_but_told(config: Config, tmp_path: P
         first = child.process
         supervisor._spawn(child)
 
-        def polled() -> None:
-            supervisor.poll()
-
         with pytest.raises(ServiceFailedError, match="already running"):
-            eventually(polled, "the second one is refused")
+            eventually(lambda: False, "the second one is refused", supervisor.poll)
         child.process = first
 
 
@@ -131,7 +123,7 @@ def test_a_taken_port_is_named_with_the_mend(config: Config, tmp_path: Path) -> 
     place = host_and_port(config.router.endpoint)
     assert place is not None
     with socket.create_server(place), _supervisor(config, tmp_path) as supervisor:
-        with pytest.raises(PortTakenError, match=f"port {place[1]} .*PLGRIM_ROUTER"):
+        with pytest.raises(PortTakenError, match=rf"port {place[1]} .*PLGRIM_ROUTER"):
             supervisor.start()
         assert _pids(supervisor) == []
 

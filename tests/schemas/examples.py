@@ -68,7 +68,8 @@ def _value(kind: Any, field: FieldInfo | None = None) -> Any:
 
 
 def _scalar(kind: type, field: FieldInfo | None) -> Any:
-    adapter: TypeAdapter[Any] = TypeAdapter(Annotated[kind, field] if field is not None else kind)
+    checked: Any = Annotated[kind, field] if field is not None else kind
+    adapter: TypeAdapter[Any] = TypeAdapter(checked)
     for candidate in _CANDIDATES[kind]:
         try:
             return adapter.validate_python(candidate)

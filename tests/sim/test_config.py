@@ -44,7 +44,8 @@ def test_senseless_values(data: dict[str, Any]) -> None:
 
 
 def test_profiles_set_defaults_that_fields_override() -> None:
-    assert RobotConfig().footprint_radius_m == 0.335
+    assert RobotConfig() == RobotConfig(profile="spot")
+    assert RobotConfig(profile="husky").footprint_radius_m == 0.335
     assert RobotConfig(profile="spot").footprint_radius_m == 0.25
     assert RobotConfig(profile="spot", footprint_radius_m=0.3).footprint_radius_m == 0.3
     assert SimConfig.model_validate({"robot": {"profile": "spot"}}).robot.footprint_radius_m == 0.25

@@ -16,6 +16,7 @@ from services.sim.world import World, deepest_free_point
 from tests.sim.helpers import box, with_walls
 
 NO_SLIP = SimConfig(slip_fraction=0.0)
+RADIUS_M = RobotConfig().footprint_radius_m
 
 
 def _robot(world: World, config: SimConfig = NO_SLIP, seed: int = 0) -> Robot:
@@ -74,7 +75,7 @@ def test_a_slow_touch_stops_and_counts_once() -> None:
     assert state.blocked
     assert state.contacts == 1
     assert not state.lost
-    assert 4.0 - 0.335 - 0.01 < state.x_m <= 4.0 - 0.335 + 1e-9
+    assert 4.0 - RADIUS_M - 0.01 < state.x_m <= 4.0 - RADIUS_M + 1e-9
     # It can turn at the wall and drive away from it.
     while abs(math.remainder(robot.state.yaw_rad - math.pi, 2 * math.pi)) > 0.1:
         robot.step(0.0, 1.0, 0.1)
@@ -116,7 +117,7 @@ def test_the_robot_never_passes_walls(seed: int) -> None:
         state = robot.step(
             float(rng.uniform(-1, 2)), float(rng.uniform(-2, 2)), float(rng.uniform(0.02, 0.5))
         )
-        assert world.clearance_m(state.x_m, state.y_m, 1.0) >= 0.335 - 1e-6
+        assert world.clearance_m(state.x_m, state.y_m, 1.0) >= RADIUS_M - 1e-6
     assert not state.lost
 
 
@@ -124,7 +125,7 @@ def test_a_thin_wall_is_not_jumped() -> None:
     world = with_walls(box(8.0, 3.0, 0.1, start=(2.0, 1.5, 0.0)), (4.0, 0.0, 4.1, 3.0))
     fast = SimConfig(robot=RobotConfig(max_speed_mps=8.0, max_acceleration_mps2=50.0), slip_fraction=0.0)
     state = _robot(world, fast).step(8.0, 0.0, 2.0)
-    assert state.x_m < 4.0 - 0.335
+    assert state.x_m < 4.0 - RADIUS_M
     assert state.lost
 
 

@@ -1,0 +1,429 @@
+"""The coverage model against plain Python: what is seen, what is blocked, what a step pays, what a path is worth."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from planning.coverage_model import (
+    BITS,
+    HEADING,
+    KEY,
+    MACRO_STEPS,
+    MAX_EDGE_RISK,
+    NODE,
+    SWEEP,
+    SWEEP_STEPS,
+    _actions,
+    _rollout,
+    _sample,
+    _step,
+    best_viewpoint,
+    edge_blocked,
+    evaluate_moves,
+    follow_rule,
+    look,
+    new_nodes,
+    reachable_entropy,
+    rollout_value,
+    turn_share,
+)
+from planning.pomcp import random_bits, random_stream
+from planning.reward import RewardWeights
+from tests.planning.coverage_lattices import Edge, Reference, random_lattice, reachable
+
+SEEDS = st.integers(0, 2**32 - 1)
+WEIGHTS = RewardWeights(
+    k_information=1.3, k_cost=0.7, k_distance_per_m=0.11, k_risk=2.0, k_turn=0.23, gamma_per_m=0.93
+)
+
+
+def start_of(lattice: Reference, rng: np.random.Generator) -> int:
+    """A node with at least one edge."""
+    return int(rng.choice(sorted({node for node, _ in lattice.edges})))
+
+
+def state_at(lattice: Reference, node: int, heading: int, key: int, covered: frozenset[int]) -> NDArray[np.int64]:
+    words = lattice.bits(covered).view(np.int64)
+    return np.concatenate([np.array([node, heading, key], np.int64), words])
+
+
+# --- what is seen -------------------------------------------------------------------------------------------------
+
+
+@given(SEEDS, st.integers(1, 9), st.integers(0, 4), st.sampled_from([60.0, 90.0, 120.0, 200.0, 360.0]))
+def test_a_look_covers_the_footprint_and_pays_its_entropies(
+    seed: int, size: int, reach: int, fov_deg: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(seed, size, reach, fov_deg, wall_share=0.1, hidden_share=0.3, covered_share=0.2)
+    model = lattice.model()
+    before = frozenset(int(i) for i in np.flatnonzero(rng.random(size * size) < 0.3))
+    covered = lattice.bits(before)
+    node, heading = int(rng.integers(size * size)), int(rng.integers(8))
+    fresh = lattice.footprint(node, heading) - before
+    assert new_nodes(model, node, heading, covered) == len(fresh)
+    information = look(model, node, heading, covered)
+    assert math.isclose(information, lattice.information(fresh), rel_tol=1e-12, abs_tol=1e-12)
+    assert lattice.nodes(covered) == before | fresh
+    assert look(model, node, heading, covered) == 0.0
+
+
+def test_the_widest_lattice_fits_into_its_words() -> None:
+    """61 nodes a side and reach 15: bits are shifted to the ends of the words."""
+    lattice = random_lattice(3, 61, 15, 360.0, hidden_share=0.5)
+    model = lattice.model()
+    for node in (0, 60, 61 * 30 + 30, 61 * 60, 61 * 61 - 1, 61 * 7 + 55, 61 * 7 + 3):
+        covered = lattice.bits(())
+        look(model, node, 0, covered)
+        assert lattice.nodes(covered) == lattice.footprint(node, 0)
+
+
+@given(SEEDS)
+def test_only_what_a_connected_node_sees_has_entropy(seed: int) -> None:
+    lattice = random_lattice(seed, 6, 2, wall_share=0.5, hidden_share=0.5)
+    model = lattice.model()
+    connected = {node for node, _ in lattice.edges}
+    seen = set().union(*(lattice.sees[node] for node in connected)) if connected else set()
+    entropy = np.random.default_rng(seed).uniform(0.1, 1.0, 36).astype(np.float32)
+    found = reachable_entropy(entropy, model.visible, model.edge_distance_m, 6, 2)
+    np.testing.assert_array_equal(found, [entropy[i] if i in seen else 0.0 for i in range(36)])
+
+
+# --- what is blocked ----------------------------------------------------------------------------------------------
+
+
+def test_an_edge_is_blocked_from_both_ends_and_again_and_again() -> None:
+    lattice = random_lattice(5, 6, 1, risky_share=1.0)
+    model, rng = lattice.model(), random_stream(1)
+    answers = set()
+    for _ in range(50):
+        key = int(random_bits(rng) >> np.uint64(1))
+        for node, k in lattice.edges:
+            blocked = edge_blocked(model, key, node, k)
+            assert blocked == edge_blocked(model, key, lattice.neighbour(node, k), (k + 4) % 8)
+            assert blocked == edge_blocked(model, key, node, k)
+            answers.add(blocked)
+    assert answers == {True, False}
+
+
+def test_edges_are_blocked_as_often_as_rho_says_and_independently() -> None:
+    """Six standard deviations of the binomial: one false alarm in 10^9, and the keys are fixed anyway."""
+    lattice = random_lattice(5, 4, 1, risky_share=1.0)
+    model, rng = lattice.model(), random_stream(2)
+    edges = [(node, k) for node, k in lattice.edges if k < 4]
+    keys = [int(random_bits(rng) >> np.uint64(1)) for _ in range(2000)]
+    blocked = np.array([[edge_blocked(model, key, node, k) for node, k in edges] for key in keys])
+    rho = np.array([lattice.edges[edge].risk for edge in edges])
+    deviation = np.sqrt(rho * (1.0 - rho) / len(keys))
+    assert np.all(np.abs(blocked.mean(axis=0) - rho) < 6.0 * deviation)
+    together = blocked.T.astype(float) @ blocked / len(keys)
+    expected = np.outer(rho, rho)
+    off = np.abs(together - expected) / np.sqrt(expected * (1.0 - expected) / len(keys))
+    assert off[~np.eye(len(edges), dtype=bool)].max() < 6.0
+
+
+def test_an_edge_without_risk_is_never_blocked() -> None:
+    lattice = random_lattice(5, 4, 1)
+    model, rng = lattice.model(), random_stream(3)
+    for _ in range(200):
+        key = int(random_bits(rng) >> np.uint64(1))
+        assert not any(edge_blocked(model, key, node, k) for node, k in lattice.edges)
+
+
+# --- what a step pays ---------------------------------------------------------------------------------------------
+
+
+def reference_action(
+    lattice: Reference, state: NDArray[np.int64], directions: list[int]
+) -> tuple[NDArray[np.int64], float, float, float, bool]:
+    """Moves until one is impossible or blocked. Returns (state, reward, discount, information, blocked)."""
+    model = lattice.model()
+    node, heading, key = (int(v) for v in state[:BITS])
+    covered = lattice.nodes(state[BITS:].view(np.uint64))
+    value, discount, blocked, before = 0.0, 1.0, False, covered
+    for k in directions:
+        edge = lattice.edges.get((node, k))
+        if edge is None or edge.risk > MAX_EDGE_RISK or blocked:
+            break
+        blocked = edge_blocked(model, key, node, k)
+        node, covered, gained, factor = lattice.move(node, heading, covered, k, blocked)
+        heading = k
+        value += discount * gained
+        discount *= factor
+    information = lattice.information(covered - before)
+    return state_at(lattice, node, heading, key, covered), value, discount, information, blocked
+
+
+@settings(max_examples=120)
+@given(SEEDS, st.integers(0, 15))
+def test_a_step_pays_the_formula_and_discounts_by_travel(seed: int, action: int) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(
+        seed, 6, 2, wall_share=0.1, risky_share=0.5, hidden_share=0.2, weights=WEIGHTS
+    )
+    covered = frozenset(int(i) for i in np.flatnonzero(rng.random(36) < 0.2))
+    state = state_at(
+        lattice, start_of(lattice, rng), int(rng.integers(8)), int(rng.integers(2**62)), covered
+    )
+    directions = [action % 8] * (1 if action < 8 else MACRO_STEPS)
+    expected, value, factor, information, blocked = reference_action(lattice, state, directions)
+    observation, reward, discount, terminal = _step(lattice.model(), state, action, random_stream(0))
+    np.testing.assert_array_equal(state, expected)
+    assert math.isclose(reward, value, rel_tol=1e-6, abs_tol=1e-9)
+    assert math.isclose(discount, factor, rel_tol=1e-6)
+    assert not terminal
+    assert (observation >= 8) == blocked
+    assert observation % 8 == sum(information > bound for bound in (0.02, 0.5, 1.5, 3.0))
+
+
+@given(SEEDS)
+def test_a_sweep_is_the_informed_rule(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(seed, 6, 2, wall_share=0.1, weights=WEIGHTS)
+    node, heading = start_of(lattice, rng), int(rng.integers(8))
+    model = lattice.model(node, heading)
+    state = state_at(lattice, node, heading, 7, frozenset())
+    moves = np.zeros(SWEEP_STEPS, np.int64)
+    count = follow_rule(model, node, heading, model.covered.copy(), moves)
+    expected, value, factor, _, _ = reference_action(lattice, state, [int(k) for k in moves[:count]])
+    _, reward, discount, _ = _step(model, state, SWEEP, random_stream(0))
+    np.testing.assert_array_equal(state, expected)
+    assert math.isclose(reward, value, rel_tol=1e-6, abs_tol=1e-9)
+    assert math.isclose(discount, factor, rel_tol=1e-6)
+
+
+def test_mu_is_the_turn_as_a_share_of_half_a_turn() -> None:
+    for heading, k in itertools.product(range(8), range(8)):
+        off = abs(math.remainder((heading - k) * math.pi / 4.0, 2.0 * math.pi))
+        assert math.isclose(turn_share(heading, k), off / math.pi, abs_tol=1e-12)
+
+
+@given(SEEDS)
+def test_the_actions_are_the_edges_that_may_be_taken(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(seed, 5, 1, wall_share=0.3, risky_share=0.5)
+    for key, edge in list(lattice.edges.items()):
+        if edge.risk > 0.7:
+            lattice.edges[key] = Edge(edge.distance_m, 0.95)
+    node, out = int(rng.integers(25)), np.zeros(17, np.int64)
+    state = state_at(lattice, node, int(rng.integers(8)), 1, frozenset())
+    count = _actions(lattice.model(), state, out)
+    singles = {k for k in lattice.directions(node) if lattice.edges[node, k].risk <= MAX_EDGE_RISK}
+    macros = {8 + k for k in singles if (lattice.neighbour(node, k), k) in lattice.edges}
+    assert set(out[:count].tolist()) == (singles | macros | {SWEEP} if singles else set())
+    assert len(set(out[:count].tolist())) == count
+
+
+def test_particles_are_drawn_as_often_as_they_weigh() -> None:
+    lattice = random_lattice(1, 4, 1)
+    weights = np.array([0.5, 0.3, 0.15, 0.05])
+    model = lattice.model(covered=[3, 9])._replace(
+        particle_node=np.array([0, 5, 10, 15], np.int32),
+        particle_heading=np.array([1, 3, 5, 7], np.uint8),
+        particle_weight=weights,
+    )
+    rng, state = random_stream(4), np.zeros(BITS + 4, np.int64)
+    tally, keys = np.zeros(4), set()
+    for _ in range(4000):
+        state[:] = -1
+        _sample(model, rng, state)
+        assert state[HEADING] == 1 + 2 * (state[NODE] // 5)
+        assert lattice.nodes(state[BITS:].view(np.uint64)) == {3, 9}
+        tally[state[NODE] // 5] += 1
+        keys.add(int(state[KEY]))
+    assert np.all(np.abs(tally / 4000 - weights) < 6.0 * np.sqrt(weights * (1.0 - weights) / 4000))
+    assert len(keys) == 4000
+
+
+# --- what a path is worth -----------------------------------------------------------------------------------------
+
+
+def random_path(lattice: Reference, rng: np.random.Generator, node: int, length: int) -> list[int]:
+    """Moves over edges, none of them twice: a second try of the same edge would have the same outcome."""
+    moves: list[int] = []
+    used: set[frozenset[int]] = set()
+    for _ in range(length):
+        free = [
+            k
+            for k in lattice.directions(node)
+            if frozenset((node, lattice.neighbour(node, k))) not in used
+            and lattice.edges[node, k].risk <= MAX_EDGE_RISK
+        ]
+        if not free:
+            break
+        k = int(rng.choice(free))
+        used.add(frozenset((node, lattice.neighbour(node, k))))
+        moves.append(k)
+        node = lattice.neighbour(node, k)
+    return moves
+
+
+def exhaustive_rewards(
+    lattice: Reference, node: int, heading: int, covered: frozenset[int], moves: list[int]
+) -> tuple[list[float], list[float]]:
+    """Expected reward of each step and the probability of being past it, over all outcomes of all edges.
+
+    The semantics that is exact: steps are attempted in order; a blocked one turns the robot, pays turn and risk but no
+    distance, and nothing follows it.
+    """
+    rewards, alive = [0.0] * len(moves), [0.0] * len(moves)
+    nodes = [node]
+    for k in moves:
+        nodes.append(lattice.neighbour(nodes[-1], k))
+    risks = [lattice.edges[a, k].risk for a, k in zip(nodes, moves, strict=False)]
+    for outcome in itertools.product((False, True), repeat=len(moves)):
+        weight = math.prod(r if blocked else 1.0 - r for r, blocked in zip(risks, outcome, strict=True))
+        at, facing, seen = node, heading, covered
+        for i, (k, blocked) in enumerate(zip(moves, outcome, strict=True)):
+            at, seen, gained, _ = lattice.move(at, facing, seen, k, blocked)
+            facing = k
+            rewards[i] += weight * gained
+            if blocked:
+                break
+            alive[i] += weight
+    return rewards, alive
+
+
+@given(SEEDS)
+def test_a_path_is_worth_the_expectation_over_all_outcomes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(seed, 5, 2, risky_share=0.6, hidden_share=0.2, weights=WEIGHTS)
+    node, heading = start_of(lattice, rng), int(rng.integers(8))
+    before = frozenset(int(i) for i in np.flatnonzero(rng.random(25) < 0.2))
+    moves = random_path(lattice, rng, node, 6)
+    expected, alive = exhaustive_rewards(lattice, node, heading, before, moves)
+    covered = lattice.bits(before)
+    out = np.zeros(6), np.zeros(6), np.zeros(6)
+    count = evaluate_moves(lattice.model(), node, heading, np.array(moves, np.int64), covered, *out)
+    assert count == len(moves)
+    np.testing.assert_allclose(out[0][:count], expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(out[2][:count], alive, rtol=1e-6)
+    at, seen = node, before
+    for i, k in enumerate(moves):
+        assert math.isclose(out[1][i], lattice.edges[at, k].distance_m, rel_tol=1e-9)
+        at, seen, _, _ = lattice.move(at, heading, seen, k, False)
+        heading = k
+    assert lattice.nodes(covered) == seen
+
+
+@pytest.mark.parametrize("risk", [None, 0.95])
+def test_a_path_ends_at_an_edge_that_is_gone_or_impassable(risk: float | None) -> None:
+    lattice = random_lattice(1, 5, 1, weights=WEIGHTS)
+    for node, k in ((2, 0), (3, 4)):
+        if risk is None:
+            del lattice.edges[node, k]
+        else:
+            lattice.edges[node, k] = Edge(1.0, risk)
+    out = np.zeros(4), np.zeros(4), np.zeros(4)
+    assert evaluate_moves(lattice.model(), 0, 0, np.zeros(4, np.int64), lattice.bits(()), *out) == 2
+
+
+# --- the informed rule --------------------------------------------------------------------------------------------
+
+
+@given(SEEDS)
+def test_the_rule_stays_on_edges_and_covers_all_that_can_be_covered(seed: int) -> None:
+    """With sight all around it ends by itself, and only when nothing is left that some reachable node sees."""
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(seed, 7, 2, 360.0, wall_share=0.35, hidden_share=0.4, covered_share=0.3)
+    node = start_of(lattice, rng)
+    model = lattice.model(node, 0)
+    moves, covered = np.zeros(300, np.int64), model.covered.copy()
+    count = follow_rule(model, node, 0, covered, moves)
+    assert count < 300
+    at, heading, seen = node, 0, frozenset[int]()
+    for k in moves[:count]:
+        assert (at, int(k)) in lattice.edges
+        at, seen, _, _ = lattice.move(at, heading, seen, int(k), False)
+        heading = int(k)
+    assert lattice.nodes(covered) == seen
+    within = reachable(lattice, node)
+    coverable = set().union(*(lattice.sees[i] for i in within)) - lattice.sees[node]
+    assert coverable <= seen
+
+
+@given(SEEDS)
+def test_every_node_that_can_be_covered_has_a_group_and_a_way_to_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(seed, 8, 2, wall_share=0.35, hidden_share=0.4, covered_share=0.3)
+    node = start_of(lattice, rng)
+    model = lattice.model(node, 0)
+    within = reachable(lattice, node)
+    coverable = set().union(*(lattice.sees[i] for i in within))
+    with_way: set[int] = set()
+    for c in range(len(model.cluster_top)):
+        if not math.isfinite(model.cluster_cost[c, node]):
+            continue
+        at, steps = node, 0
+        while model.cluster_move[c, at] >= 0 and steps < 64:
+            assert (at, int(model.cluster_move[c, at])) in lattice.edges
+            at, steps = lattice.neighbour(at, int(model.cluster_move[c, at])), steps + 1
+        words = np.zeros(9, np.uint64)
+        top = int(model.cluster_top[c])
+        words[top : top + 3] = model.cluster_rows[c][: 9 - top]
+        members = lattice.nodes(words[:8])
+        assert members & lattice.sees[at], "the way ends where nothing of the group is seen"
+        with_way |= members
+    assert coverable <= with_way
+
+
+def test_a_viewpoint_sees_most_of_its_block() -> None:
+    lattice = random_lattice(11, 7, 2, 360.0, hidden_share=0.5)
+    block = {r * 7 + c for r in range(3, 6) for c in range(3, 6)}
+    words = lattice.bits(block)[3:6].copy()
+    cost = np.zeros(49)
+    model = lattice.model()
+    best = best_viewpoint(model.visible, cost, 7, 2, 3, words, 4.0, 4.0)
+    scores = {
+        node: len(lattice.sees[node] & block) - 0.3 * math.hypot(node // 7 - 4, node % 7 - 4)
+        for node in range(49)
+        if lattice.sees[node] & block
+    }
+    assert math.isclose(scores[best], max(scores.values()))
+
+
+# --- rollouts -----------------------------------------------------------------------------------------------------
+
+
+@given(SEEDS)
+def test_a_rollout_without_chance_is_the_rule_and_the_leaf(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(seed, 6, 2, wall_share=0.1, weights=WEIGHTS)
+    leaf = rng.uniform(0.0, 5.0, 36)
+    node, heading = start_of(lattice, rng), int(rng.integers(8))
+    model = lattice.model(node, heading, rollout_steps=5)._replace(leaf_value=leaf)
+    moves = np.zeros(5, np.int64)
+    count = follow_rule(model, node, heading, model.covered.copy(), moves)
+    value, discount, at, facing, seen = 0.0, 1.0, node, heading, frozenset[int]()
+    for k in moves[:count]:
+        at, seen, gained, factor = lattice.move(at, facing, seen, int(k), False)
+        value, discount, facing = value + discount * gained, discount * factor, int(k)
+    value += discount * leaf[at]
+    assert math.isclose(
+        rollout_value(model, node, heading, model.covered, random_stream(1), 3), value, rel_tol=1e-6, abs_tol=1e-9
+    )
+    state = state_at(lattice, node, heading, 5, frozenset())
+    assert _rollout(model, state, 0, random_stream(1)) == leaf[node]
+
+
+def test_rollouts_with_chance_stay_on_edges() -> None:
+    """Random moves too: `look` would raise on a node outside, and the state must end on a node that exists."""
+    lattice = random_lattice(9, 6, 1, wall_share=0.3, risky_share=0.5)
+    rng = random_stream(8)
+    nodes = {node for node, _ in lattice.edges}
+    start = min(nodes)
+    model = lattice.model(start, rollout_steps=30, rollout_random=0.7)
+    within, ends = reachable(lattice, start), set()
+    for key in range(300):
+        state = state_at(lattice, start, 0, key, frozenset())
+        _rollout(model, state, 1, rng)
+        ends.add(int(state[NODE]))
+    assert ends <= within
+    assert len(ends) > 5
