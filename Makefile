@@ -32,25 +32,24 @@ export UV_LINK_MODE ?= copy
 # Third-party maps and recordings, which the tests that need them skip visibly without.
 export PLGRIM_DATA_DIR ?= $(abspath ../shared/data)
 
-.PHONY: help env kernels demo test test-slow lint format check bench lock clean
+.PHONY: help venv env demo test test-slow lint format check bench lock clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
 
 # Installed from exactly these locks, in exactly this folder: then there is nothing to do. A stamp by content,
 # since a clone gives every file the same time stamp.
-env:
+venv:
 	@stamp=$$({ cat $(LOCKS) pyproject.toml; echo "$(CURDIR)"; } | git hash-object --stdin)
 	if [ ! -x $(BIN)/python ] || [ "$$(cat $(VENV)/.installed 2>/dev/null)" != "$$stamp" ]; then
 	  deploy/install.sh "$(VENV)" "$(PYTHON)" "$(UV)"
 	  echo "$$stamp" >$(VENV)/.installed
 	fi
-	$(MAKE) kernels
 
-# Compiles the kernels into the cache once for this source, so that no service compiles while a mission runs.
-kernels:
-	@if [ ! -f plgrim/warmup.py ]; then exit 0; fi
-	stamp=$$({ find planning services -name '*.py' | LC_ALL=C sort | xargs cat; cat plgrim/warmup.py; } | git hash-object --stdin)
+# Compiles the kernels into the cache once for these sources (those that hold a kernel, as in planning/kernels.py),
+# so that no service compiles while a mission runs.
+env: venv
+	@stamp=$$(grep -rlE --include='*.py' 'njit|overload' planning services | LC_ALL=C sort | xargs cat | git hash-object --stdin)
 	cache="$${PLGRIM_CACHE_DIR:-$$HOME/.cache/plgrim}/numba"
 	if [ ! -d "$$cache" ] || [ "$$(cat $(VENV)/.kernels 2>/dev/null)" != "$$stamp $$cache" ]; then
 	  echo "env: compiling the kernels into $$cache (once for this source)"
@@ -67,13 +66,13 @@ test: env
 test-slow: env
 	@$(BIN)/python -m pytest $(PYTEST_ARGS)
 
-lint: env
+lint: venv
 	@echo "lint: ruff check"; $(BIN)/ruff check $(SOURCES)
 	echo "lint: ruff format --check"; $(BIN)/ruff format --check $(SOURCES)
 	echo "lint: mypy --strict"; $(BIN)/mypy
 	echo "lint: import contracts"; $(BIN)/lint-imports --config pyproject.toml
 
-format: env
+format: venv
 	@$(BIN)/ruff check --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
 
@@ -97,7 +96,7 @@ bench: env
 # No file names a download host: the hashes alone say what may be installed.
 COMPILE := $(BIN)/uv pip compile --no-config --universal --python-version 3.11 --fork-strategy fewest --generate-hashes \
   --no-header --no-emit-index-url --no-emit-find-links --quiet $(LOCK_ARGS)
-lock: env
+lock: venv
 	@echo "lock: resolving; LOCK_ARGS=--upgrade takes the newest versions"
 	$(COMPILE) requirements/build.in --output-file requirements/build.txt
 	$(COMPILE) pyproject.toml --output-file requirements/runtime.txt

@@ -1,7 +1,7 @@
 """The local coverage problem as a generative model: motion and observation model and reward (paper, LCP and Eq. 5).
 
-Shared by lcp, reconciler and baselines. State (int64): node, heading, key of the simulation's risk outcomes, then one
-word a lattice row with the bits of the nodes that this simulation has covered. Actions: 0..7 one move in that
+Shared by lcp, reconciler and baselines. State (int64): node, heading, key of the simulation's risk outcomes, moves made,
+then one word a lattice row with the bits of the nodes that this simulation has covered. Actions: 0..7 one move in that
 direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule. Observation: blocked or not,
 and how much was newly covered, binned. Whether an edge is blocked is drawn once a simulation (a hash of its key), so
 that a blocked edge stays blocked and is worth finding out about.
@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from planning.bits import count_bits, lowest_bit
 from planning.grid import DIRECTION_DX, DIRECTION_DY
 from planning.kernels import njit
-from planning.lattice_graph import neighbour, travel_costs
+from planning.lattice_graph import travel_costs
 from planning.pomcp import random_below, random_bits, random_uniform, register_model, simulate
 from planning.reward import RewardParameters, action_cost, reward, travel_discount
 
-NODE, HEADING, KEY, BITS = 0, 1, 2, 3
+NODE, HEADING, KEY, MOVES, BITS = 0, 1, 2, 3, 4
 MACRO_STEPS = 4
 SWEEP = 16
 ACTIONS = 17
@@ -30,27 +30,36 @@ SWEEP_STEPS = 6
 MAX_EDGE_RISK = 0.9
 _BINS = (0.02, 0.5, 1.5, 3.0)
 _BLOCKED = 8
+_MAX_CLUSTERS = 400
 _DX, _DY = DIRECTION_DX, DIRECTION_DY
 _ONE = np.uint64(1)
+_TURN = np.array([[min((a - b) % 8, (b - a) % 8) / 4.0 for b in range(8)] for a in range(8)])
 
 
 class CoverageModel(NamedTuple):
     """The Local IRM and what the simulations need of it; n nodes, size * size.
 
-    edge_distance_m, edge_risk: (n, 8). entropy: (n,), nats of whole patches. visible: (n, rows). wedge: (8, rows), the
-    field of view by heading. leaf_value: (n,). particle_*: (p,), the root belief. covered: (size,) bits that count as
-    covered already. cluster_*: groups of uncovered nodes for the informed rule: cluster_move (c, n) first moves,
-    cluster_cost (c, n), cluster_rows (c, 3) words, cluster_top (c,) first row. cost_order: (n, few) nearest clusters.
+    step_to: (n, 8), the neighbour in each direction, -1 outside. top: (n,), lattice row of the footprint's first row.
+    edge_distance_m, edge_risk, edge_discount: (n, 8). entropy: (n,), nats of whole patches. footprint: (n, 8, rows), the nodes that the
+    sensor covers from a node under a heading, shifted to lattice columns. leaf_value: (n,). particle_*: (p,), the root belief. covered: (size,) bits that count as
+    covered already. row_low, row_high: (n,), the rows of the footprint that are not empty, half open. cluster_*: groups of
+    uncovered nodes for the informed rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_rows (c, 3)
+    words, cluster_top (c,) first row. horizon: moves of every simulation, in the tree and the rollout
+    together, so that values of short and of long actions compare.
     """
 
     size: int
     reach: int
     weights: RewardParameters
+    step_to: NDArray[np.int32]
+    top: NDArray[np.int32]
     edge_distance_m: NDArray[np.float32]
     edge_risk: NDArray[np.float32]
+    edge_discount: NDArray[np.float64]
     entropy: NDArray[np.float64]
-    visible: NDArray[np.uint32]
-    wedge: NDArray[np.uint32]
+    row_low: NDArray[np.int32]
+    row_high: NDArray[np.int32]
+    footprint: NDArray[np.uint64]
     leaf_value: NDArray[np.float64]
     particle_node: NDArray[np.int32]
     particle_heading: NDArray[np.uint8]
@@ -60,7 +69,7 @@ class CoverageModel(NamedTuple):
     cluster_cost: NDArray[np.float32]
     cluster_rows: NDArray[np.uint64]
     cluster_top: NDArray[np.int32]
-    rollout_steps: int
+    horizon: int
     rollout_random: float
 
 
@@ -79,40 +88,51 @@ def wedge_rows(reach: int, fov_rad: float) -> NDArray[np.uint32]:
 
 
 @njit
-def footprint_row(model: CoverageModel, node: int, heading: int, r: int) -> np.uint64:
-    """Row r of the nodes that the sensor covers from (node, heading), shifted to lattice columns."""
-    word = np.uint64(model.visible[node, r] & model.wedge[heading, r])
-    shift = node % model.size - model.reach
-    if shift >= 0:
-        return word << np.uint64(shift)
-    return word >> np.uint64(-shift)
-
-
-@njit
-def new_nodes(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64]) -> int:
-    """How many nodes one look from (node, heading) would newly cover."""
+def new_nodes(
+    footprint: NDArray[np.uint64],
+    row_low: NDArray[np.int32],
+    row_high: NDArray[np.int32],
+    top: int,
+    node: int,
+    heading: int,
+    covered: NDArray[np.uint64],
+) -> int:
+    """How many nodes one look from (node, heading) would newly cover; top: lattice row of the footprint's row 0."""
     total = 0
-    top = node // model.size - model.reach
-    for r in range(2 * model.reach + 1):
-        row = top + r
-        if 0 <= row < model.size and model.visible[node, r] != 0:
-            total += count_bits(footprint_row(model, node, heading, r) & ~covered[row])
+    for r in range(row_low[node], row_high[node]):
+        total += count_bits(footprint[node, heading, r] & ~covered[top + r])
     return total
 
 
 @njit
 def look(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64]) -> float:
     """Cover what is seen from (node, heading). Returns I, the sum of the entropies of the newly covered nodes."""
+    return _look(
+        model.footprint, model.row_low, model.row_high, model.entropy, model.size, model.top[node], node, heading, covered
+    )
+
+
+@njit
+def _look(
+    footprint: NDArray[np.uint64],
+    row_low: NDArray[np.int32],
+    row_high: NDArray[np.int32],
+    entropy: NDArray[np.float64],
+    size: int,
+    top: int,
+    node: int,
+    heading: int,
+    covered: NDArray[np.uint64],
+) -> float:
     information = 0.0
-    top = node // model.size - model.reach
-    for r in range(2 * model.reach + 1):
+    for r in range(row_low[node], row_high[node]):
         row = top + r
-        if row < 0 or row >= model.size or model.visible[node, r] == 0:
+        fresh = footprint[node, heading, r] & ~covered[row]
+        if fresh == np.uint64(0):
             continue
-        fresh = footprint_row(model, node, heading, r) & ~covered[row]
         covered[row] |= fresh
         while fresh != np.uint64(0):
-            information += model.entropy[row * model.size + lowest_bit(fresh)]
+            information += entropy[row * size + lowest_bit(fresh)]
             fresh &= fresh - _ONE
     return information
 
@@ -123,7 +143,7 @@ def edge_blocked(model: CoverageModel, key: int, node: int, k: int) -> bool:
     rho = model.edge_risk[node, k]
     if rho <= 0.0:
         return False
-    other = neighbour(node, k, model.size)
+    other = model.step_to[node, k]
     low, high = min(node, other), max(node, other)
     x = np.uint64(key) ^ (np.uint64(low * 8192 + high) * np.uint64(0x9E3779B97F4A7C15))
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -135,8 +155,7 @@ def edge_blocked(model: CoverageModel, key: int, node: int, k: int) -> bool:
 @njit
 def turn_share(heading: int, k: int) -> float:
     """mu(q): the turn to direction k as a share of half a turn, 0 to 1."""
-    off = abs(heading - k) % 8
-    return min(off, 8 - off) / 4.0
+    return _TURN[heading, k]
 
 
 @njit
@@ -151,7 +170,7 @@ def _move(
     information = look(model, node, k, covered) if k != heading else 0.0
     if edge_blocked(model, state[KEY], node, k):
         return information, action_cost(model.weights, 0.0, risk, turn), 0.5 * distance, True
-    state[NODE] = neighbour(node, k, model.size)
+    state[NODE] = model.step_to[node, k]
     information += look(model, state[NODE], k, covered)
     return information, action_cost(model.weights, distance, risk, turn), distance, False
 
@@ -164,42 +183,92 @@ def greedy_direction(
 
     tried: bits of directions not to take. Returns -1 when nothing is left to cover.
     """
+    best = best_gain_direction(model, state, covered, tried)
+    return best if best >= 0 else _towards_nearest(model, state[NODE], covered, tried)
+
+
+@njit
+def best_gain_direction(
+    model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int
+) -> int:
+    """The move with the best one-step gain for its travel and risk, or -1 when no move covers anything."""
     node, heading = state[NODE], state[HEADING]
+    footprint, row_low, row_high = model.footprint, model.row_low, model.row_high
+    edge_distance_m, edge_risk, step_to, tops = model.edge_distance_m, model.edge_risk, model.step_to, model.top
+    k_risk = model.weights.k_risk
     best, best_score = -1, 0.0
     for k in range(8):
-        distance = model.edge_distance_m[node, k]
-        if distance <= 0.0 or (tried >> k) & 1 or model.edge_risk[node, k] > MAX_EDGE_RISK:
+        distance = edge_distance_m[node, k]
+        if distance <= 0.0 or (tried >> k) & 1 or edge_risk[node, k] > MAX_EDGE_RISK:
             continue
-        gain = new_nodes(model, neighbour(node, k, model.size), k, covered)
+        other = step_to[node, k]
+        gain = new_nodes(footprint, row_low, row_high, tops[other], other, k, covered)
         if gain == 0:
             continue
-        score = 0.5 * gain / (distance + 0.7 * turn_share(heading, k)) - model.weights.k_risk * float(
-            model.edge_risk[node, k]
-        )
+        score = 0.5 * gain / (distance + 0.7 * _TURN[heading, k]) - k_risk * edge_risk[node, k]
         if score > best_score:
             best, best_score = k, score
-    if best >= 0:
-        return best
-    return _towards_nearest(model, node, covered, tried)
+    return best
+
+
+@njit
+def cluster_left(model: CoverageModel, c: int, covered: NDArray[np.uint64]) -> bool:
+    """Whether a node of the group is still uncovered."""
+    for r in range(3):
+        row = model.cluster_top[c] + r
+        if row < model.size and (model.cluster_rows[c, r] & ~covered[row]) != np.uint64(0):
+            return True
+    return False
+
+
+@njit
+def nearest_cluster(model: CoverageModel, node: int, covered: NDArray[np.uint64]) -> int:
+    """The uncovered group that is the shortest way off (not one whose viewpoint this is), or -1."""
+    nearest, nearest_cost = -1, np.float32(np.inf)
+    for c in range(model.cluster_top.shape[0]):
+        if model.cluster_cost[node, c] >= nearest_cost or model.cluster_move[node, c] < 0:
+            continue
+        if cluster_left(model, c, covered):
+            nearest, nearest_cost = c, model.cluster_cost[node, c]
+    return nearest
 
 
 @njit
 def _towards_nearest(model: CoverageModel, node: int, covered: NDArray[np.uint64], tried: int) -> int:
-    nearest, nearest_cost = -1, np.float32(np.inf)
-    for c in range(model.cluster_top.shape[0]):
-        if model.cluster_cost[c, node] >= nearest_cost or model.cluster_move[c, node] < 0:
-            continue
-        left = np.uint64(0)
-        for r in range(3):
-            row = model.cluster_top[c] + r
-            if row < model.size:
-                left |= model.cluster_rows[c, r] & ~covered[row]
-        if left != np.uint64(0):
-            nearest, nearest_cost = c, model.cluster_cost[c, node]
+    nearest = nearest_cluster(model, node, covered)
     if nearest < 0:
         return -1
-    k = int(model.cluster_move[nearest, node])
-    return -1 if k < 0 or (tried >> k) & 1 else k
+    k = np.int64(model.cluster_move[node, nearest])
+    return -1 if (tried >> k) & 1 else k
+
+
+@njit
+def informed_move(
+    model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int, group: int
+) -> tuple[int, int]:
+    """The informed rule with a memory: the next move (-1: nothing left) and the group that it goes to (-1: none).
+
+    On the way to a group it does not waver: it looks again only when the group is covered or reached.
+    """
+    node = state[NODE]
+    if group >= 0 and model.cluster_move[node, group] >= 0 and tried == 0 and cluster_left(model, group, covered):
+        return np.int64(model.cluster_move[node, group]), group
+    k = best_gain_direction(model, state, covered, tried)
+    if k >= 0:
+        return k, -1
+    group = nearest_cluster(model, node, covered)
+    if group < 0:
+        return -1, -1
+    k = np.int64(model.cluster_move[node, group])
+    return (-1, -1) if (tried >> k) & 1 else (k, group)
+
+
+@njit
+def _discount(model: CoverageModel, node: int, k: int, distance: float) -> float:
+    """Discount of a move: of the whole edge, or (blocked) of what was driven of it."""
+    if distance == model.edge_distance_m[node, k]:
+        return model.edge_discount[node, k]
+    return travel_discount(model.weights, distance)
 
 
 @njit
@@ -212,6 +281,7 @@ def _sample(model: CoverageModel, rng: NDArray[np.uint64], state: NDArray[np.int
     state[NODE] = model.particle_node[particle]
     state[HEADING] = model.particle_heading[particle]
     state[KEY] = np.int64(random_bits(rng) >> np.uint64(1))
+    state[MOVES] = 0
     for row in range(model.size):
         state[BITS + row] = np.int64(model.covered[row])
 
@@ -222,21 +292,31 @@ def _step(
 ) -> tuple[int, float, float, bool]:
     covered = state[BITS:].view(np.uint64)
     steps = 1 if action < 8 else (MACRO_STEPS if action < SWEEP else SWEEP_STEPS)
-    total, seen, discount, blocked = 0.0, 0.0, 1.0, False
-    for _ in range(steps):
-        k = greedy_direction(model, state, covered, 0) if action == SWEEP else action % 8
+    total, seen, discount, blocked, group = 0.0, 0.0, 1.0, False, -1
+    for _ in range(min(steps, model.horizon - state[MOVES])):
+        k = action % 8
+        if action == SWEEP:
+            k, group = informed_move(model, state, covered, 0, group)
         if k < 0 or model.edge_distance_m[state[NODE], k] <= 0.0 or model.edge_risk[state[NODE], k] > MAX_EDGE_RISK:
             break
+        start = state[NODE]
+        state[MOVES] += 1
         information, cost, distance, blocked = _move(model, state, covered, k)
+        group = -1 if information > 0.0 else group
         total += discount * (model.weights.k_information * information - cost)
         seen += information
-        discount *= travel_discount(model.weights, distance)
+        discount *= _discount(model, start, k, distance)
         if blocked:
             break
+    if state[MOVES] >= model.horizon:
+        total += discount * model.leaf_value[state[NODE]]
+    elif discount == 1.0:  # nothing was left to do: the simulation would stand still for ever
+        state[MOVES] = model.horizon
+        total += model.leaf_value[state[NODE]]
     observation = 0
     for bound in _BINS:
         observation += 1 if seen > bound else 0
-    return observation + (_BLOCKED if blocked else 0), total, discount, False
+    return observation + (_BLOCKED if blocked else 0), total, discount, state[MOVES] >= model.horizon
 
 
 @njit
@@ -249,7 +329,7 @@ def _actions(model: CoverageModel, state: NDArray[np.int64], actions_out: NDArra
             continue
         actions_out[count] = k
         count += 1
-        beyond = neighbour(node, k, model.size)
+        beyond = model.step_to[node, k]
         if model.edge_distance_m[beyond, k] > 0.0:
             actions_out[count] = 8 + k
             count += 1
@@ -259,21 +339,23 @@ def _actions(model: CoverageModel, state: NDArray[np.int64], actions_out: NDArra
 @njit
 def _rollout(model: CoverageModel, state: NDArray[np.int64], depth_left: int, rng: NDArray[np.uint64]) -> float:
     covered = state[BITS:].view(np.uint64)
-    value, discount, tried = 0.0, 1.0, 0
-    for _ in range(model.rollout_steps if depth_left > 0 else 0):
-        k = -1
+    value, discount, tried, group = 0.0, 1.0, 0, -1
+    for _ in range(model.horizon - state[MOVES]):
+        node, k = state[NODE], -1
         if random_uniform(rng) < model.rollout_random:
-            k = np.int64(random_below(rng, 8))
-            if model.edge_distance_m[state[NODE], k] <= 0.0 or model.edge_risk[state[NODE], k] > 0.1:
+            k, group = np.int64(random_below(rng, 8)), -1
+            if model.edge_distance_m[node, k] <= 0.0 or model.edge_risk[node, k] > 0.1:
                 k = -1
         if k < 0:
-            k = greedy_direction(model, state, covered, tried)
+            k, group = informed_move(model, state, covered, tried, group)
         if k < 0:
             break
         information, cost, distance, blocked = _move(model, state, covered, k)
+        if information > 0.0:
+            group = -1
         tried = tried | (1 << k) if blocked else 0
         value += discount * (model.weights.k_information * information - cost)
-        discount *= travel_discount(model.weights, distance)
+        discount *= _discount(model, node, k, distance)
     return value + discount * model.leaf_value[state[NODE]]
 
 
@@ -292,7 +374,7 @@ def rollout_value(model: CoverageModel, node: int, heading: int, covered: NDArra
     state = np.empty(BITS + model.size, np.int64)
     total = 0.0
     for _ in range(count):
-        state[NODE], state[HEADING] = node, heading
+        state[NODE], state[HEADING], state[MOVES] = node, heading, 0
         state[KEY] = np.int64(random_bits(rng) >> np.uint64(1))
         for row in range(model.size):
             state[BITS + row] = np.int64(covered[row])
@@ -313,11 +395,10 @@ def evaluate_moves(
 ) -> int:
     """Expected reward of each step of a path under the current belief (paper, Eq. 13).
 
-    moves: (k,) directions. covered: (size,), changed: what the path covers. A step that fails (probability rho) ends
-    the path; alive_out: probability of getting that far. Returns how many steps can be made (an edge that is gone or
-    impassable ends the path).
+    moves: (k,) directions. covered: (size,), changed: what the path covers. A step that fails (probability rho) turns
+    the robot, drives nowhere and ends the path; alive_out: probability of getting past the step. Exact when no edge
+    comes twice. Returns how many steps can be made (an edge that is gone or impassable ends the path).
     """
-    state = np.empty(BITS + model.size, np.int64)
     alive = 1.0
     for i in range(moves.shape[0]):
         k = moves[i]
@@ -325,14 +406,14 @@ def evaluate_moves(
         if distance <= 0.0 or risk > MAX_EDGE_RISK:
             return i
         information = look(model, node, k, covered) if k != heading else 0.0
-        other = neighbour(node, k, model.size)
+        other = model.step_to[node, k]
         information += (1.0 - risk) * look(model, other, k, covered)
-        reward_out[i] = alive * reward(model.weights, information, distance, risk, turn_share(heading, k))
+        driven = (1.0 - risk) * distance
+        reward_out[i] = alive * reward(model.weights, information, driven, risk, turn_share(heading, k))
         distance_out[i] = distance
         alive *= 1.0 - risk
         alive_out[i] = alive
         node, heading = other, k
-    state[0] = node
     return moves.shape[0]
 
 
@@ -349,7 +430,7 @@ def follow_rule(
             return i
         if k != state[HEADING]:
             look(model, state[NODE], k, covered)
-        state[NODE], state[HEADING] = neighbour(state[NODE], k, model.size), k
+        state[NODE], state[HEADING] = model.step_to[state[NODE], k], k
         look(model, state[NODE], k, covered)
         moves_out[i] = k
     return moves_out.shape[0]
@@ -389,7 +470,7 @@ def best_viewpoint(
     """
     best, best_score = -1, 0.0
     for row in range(max(0, top - reach), min(size, top + 3 + reach)):
-        for column in range(max(0, int(middle_column) - reach), min(size, int(middle_column) + reach + 1)):
+        for column in range(max(0, int(middle_column) - 2 - reach), min(size, int(middle_column) + 3 + reach)):
             node = row * size + column
             if not math.isfinite(cost[node]):
                 continue
@@ -410,6 +491,70 @@ def best_viewpoint(
     return best
 
 
+@njit
+def _see_block(
+    visible: NDArray[np.uint32], node: int, size: int, reach: int, top: int, words: NDArray[np.uint64], seen: NDArray[np.uint64]
+) -> None:
+    """Move the nodes of a block that a node sees (whatever its heading) from `words` to `seen`, (3,) each."""
+    shift = node % size - reach
+    for r in range(3):
+        seen[r] = np.uint64(0)
+        offset = top + r - node // size + reach
+        if 0 <= offset <= 2 * reach and top + r < size:
+            word = np.uint64(visible[node, offset])
+            word = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
+            seen[r] = word & words[r]
+            words[r] &= ~seen[r]
+
+
+@njit
+def _clusters(
+    grid: NDArray[np.bool_],
+    reach: int,
+    visible: NDArray[np.uint32],
+    edge_distance_m: NDArray[np.float32],
+    edge_risk: NDArray[np.float32],
+    risk_weight_m: float,
+    root: int,
+    moves: NDArray[np.int8],
+    costs: NDArray[np.float32],
+    rows: NDArray[np.uint64],
+    tops: NDArray[np.int32],
+) -> int:
+    size = grid.shape[0]
+    n = size * size
+    root_cost, cost, move = np.empty(n), np.empty(n), np.empty(n, np.int8)
+    words, seen = np.zeros(3, np.uint64), np.zeros(3, np.uint64)
+    travel_costs(root, size, edge_distance_m, edge_risk, risk_weight_m, MAX_EDGE_RISK, root_cost, move)
+    count = 0
+    for top in range(0, size, 3):
+        for left in range(0, size, 3):
+            total, middle_row, middle_column = 0, 0.0, 0.0
+            for r in range(3):
+                words[r] = np.uint64(0)
+                for c in range(left, min(left + 3, size)):
+                    if top + r < size and grid[top + r, c]:
+                        words[r] |= _ONE << np.uint64(c)
+                        total += 1
+                        middle_row += top + r
+                        middle_column += c
+            while total > 0 and count < tops.shape[0] and (words[0] | words[1] | words[2]) != np.uint64(0):
+                source = best_viewpoint(
+                    visible, root_cost, size, reach, top, words, middle_row / total, middle_column / total
+                )
+                if source < 0:
+                    break
+                _see_block(visible, source, size, reach, top, words, seen)
+                travel_costs(
+                    source, size, edge_distance_m, edge_risk, risk_weight_m, MAX_EDGE_RISK, cost, move
+                )
+                for i in range(n):
+                    moves[i, count], costs[i, count] = move[i], cost[i]
+                rows[count], tops[count] = seen, top
+                count += 1
+    return count
+
+
 def clusters(
     entropy: NDArray[np.float64],
     size: int,
@@ -420,38 +565,54 @@ def clusters(
     risk_weight_m: float,
     root: int,
 ) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.uint64], NDArray[np.int32]]:
-    """Groups of uncovered nodes (blocks of 3 x 3) and the way to each from every node, for the informed rule."""
+    """Groups of uncovered nodes (blocks of 3 x 3) and the way to each from every node, for the informed rule.
+
+    Behind a corner one viewpoint may not see the whole block: what it does not see is a group of its own, else the
+    rule would come back to this place for ever. Returns moves (n, c), costs (n, c), rows (c, 3), tops (c,).
+    """
     n = size * size
+    moves, costs = np.full((n, _MAX_CLUSTERS), -1, np.int8), np.full((n, _MAX_CLUSTERS), np.inf, np.float32)
+    rows, tops = np.zeros((_MAX_CLUSTERS, 3), np.uint64), np.zeros(_MAX_CLUSTERS, np.int32)
     grid = entropy.reshape(size, size) > 0.0
-    root_cost, move = np.empty(n), np.empty(n, np.int8)
-    travel_costs(root, size, edge_distance_m, edge_risk, risk_weight_m, MAX_EDGE_RISK, root_cost, move)
-    moves, costs, rows, tops = [], [], [], []
-    for top in range(0, size, 3):
-        for left in range(0, size, 3):
-            block = grid[top : top + 3, left : left + 3]
-            if not block.any():
-                continue
-            words = np.zeros(3, np.uint64)
-            for r, c in np.argwhere(block):
-                words[r] |= np.uint64(1) << np.uint64(left + c)
-            middle = np.argwhere(block).mean(axis=0) + np.array([top, left])
-            source = best_viewpoint(visible, root_cost, size, reach, top, words, middle[0], middle[1])
-            if source < 0:
-                continue
-            cost = np.empty(n)
-            travel_costs(
-                source, size, edge_distance_m, edge_risk, risk_weight_m, MAX_EDGE_RISK, cost, move
-            )
-            moves.append(move.copy())
-            costs.append(cost.astype(np.float32))
-            rows.append(words)
-            tops.append(top)
-    return (
-        np.array(moves, np.int8).reshape(-1, n),
-        np.array(costs, np.float32).reshape(-1, n),
-        np.array(rows, np.uint64).reshape(-1, 3),
-        np.array(tops, np.int32),
+    count = _clusters(
+        grid, reach, visible, edge_distance_m, edge_risk, risk_weight_m, root, moves, costs, rows, tops
     )
+    return moves[:, :count].copy(), costs[:, :count].copy(), rows[:count].copy(), tops[:count].copy()
+
+
+@njit
+def _row_bounds(visible: NDArray[np.uint32], size: int, reach: int, low: NDArray[np.int32], high: NDArray[np.int32]) -> None:
+    """The rows of each node that lie in the lattice and are not empty, half open."""
+    for node in range(size * size):
+        low[node] = high[node] = 0
+        first = True
+        for r in range(2 * reach + 1):
+            row = node // size - reach + r
+            if 0 <= row < size and visible[node, r] != 0:
+                low[node] = r if first else low[node]
+                high[node] = r + 1
+                first = False
+
+
+@njit
+def _footprints(
+    visible: NDArray[np.uint32], wedge: NDArray[np.uint32], size: int, reach: int, footprint: NDArray[np.uint64]
+) -> None:
+    """What is visible and in the field of view, by node and heading, shifted to lattice columns; (n, 8, rows) out."""
+    for node in range(size * size):
+        shift = node % size - reach
+        for k in range(8):
+            for r in range(2 * reach + 1):
+                word = np.uint64(visible[node, r] & wedge[k, r])
+                footprint[node, k, r] = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
+
+
+def lattice_steps(size: int) -> NDArray[np.int32]:
+    """The neighbour of each node in each direction, -1 outside the lattice, (n, 8)."""
+    row, column = np.divmod(np.arange(size * size)[:, None], size)
+    row, column = row + _DY[None, :], column + _DX[None, :]
+    inside = (row >= 0) & (column >= 0) & (row < size) & (column < size)
+    return np.where(inside, row * size + column, -1).astype(np.int32)
 
 
 def reachable_entropy(
@@ -489,16 +650,23 @@ def build_model(
     leaf_value: NDArray[np.float64],
     root: RootBelief,
     weights: RewardParameters,
-    rollout_steps: int,
+    horizon: int,
     rollout_random: float,
 ) -> CoverageModel:
     """The model of an episode from the columns of a Local IRM (shapes as in `CoverageModel`)."""
     start = int(root.node[int(np.argmax(root.weight))])
     risk_weight_m = weights.k_risk / max(weights.k_distance_per_m, 1e-3)
-    move, cost, rows, top = clusters(
-        entropy, size, reach, visible, edge_distance_m, edge_risk, risk_weight_m, start
-    )
+    # Copies: arrays of a decoded message are read-only, which is another type to the compiler and a second compilation.
+    distance, risk, seen = np.array(edge_distance_m), np.array(edge_risk), np.array(visible)
+    move, cost, rows, top = clusters(entropy, size, reach, seen, distance, risk, risk_weight_m, start)
+    low, high = np.zeros(size * size, np.int32), np.zeros(size * size, np.int32)
+    _row_bounds(seen, size, reach, low, high)
+    step_to, top_row = lattice_steps(size), (np.arange(size * size, dtype=np.int32) // size - reach).astype(np.int32)
+    footprint = np.zeros((size * size, 8, 2 * reach + 1), np.uint64)
+    _footprints(seen, wedge_rows(reach, fov_rad), size, reach, footprint)
     return CoverageModel(
-        size, reach, weights, edge_distance_m, edge_risk, entropy, visible, wedge_rows(reach, fov_rad), leaf_value,
-        root.node, root.heading, root.weight, root.covered, move, cost, rows, top, rollout_steps, rollout_random,
+        size, reach, weights, step_to, top_row, distance, risk, weights.gamma_per_m ** distance.astype(np.float64),
+        np.array(entropy), low, high, footprint, np.array(leaf_value),
+        np.array(root.node), np.array(root.heading),
+        np.array(root.weight), np.array(root.covered), move, cost, rows, top, horizon, rollout_random,
     )  # fmt: skip

@@ -23,7 +23,7 @@ class RewardWeights(BaseModel):
     k_distance_per_m: float = Field(0.05, ge=0, le=100, description="k_d, per metre: more is lazier.")
     k_risk: float = Field(5.0, ge=0, le=1000, description="k_rho, per unit of rho: more is more careful.")
     k_turn: float = Field(0.1, ge=0, le=100, description="k_mu, for half a turn (mu = 1).")
-    gamma_per_m: float = Field(0.97, gt=0, le=1, description="Discount for a metre travelled.")
+    gamma_per_m: float = Field(0.985, gt=0, le=1, description="Discount for a metre travelled.")
 
 
 class RewardParameters(NamedTuple):

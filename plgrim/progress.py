@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import TracebackType
 from typing import Any
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
@@ -87,19 +87,20 @@ class MissionProgress:
             self._shown_s = now
             self._console.print(self._note or progress_text(self._recorder), soft_wrap=True, highlight=False)
 
-    def _render(self) -> Group:
+    def _render(self) -> RenderableType:
         if self._note:
-            return Group(Text(self._note))
+            return Text(self._note)
         coverage = self._recorder.coverage
-        bar = ProgressBar(total=1.0, completed=coverage.covered_fraction if coverage else 0.0, width=60)
-        lines: list[RenderableType] = [
-            Text(progress_text(self._recorder)),
-            bar,
-            Text(target_text(self._recorder)),
-        ]
+        rows = Table.grid(padding=0)
+        rows.add_column(no_wrap=True)
+        rows.add_row(Text(progress_text(self._recorder), overflow="ellipsis"))
+        rows.add_row(
+            ProgressBar(total=1.0, completed=coverage.covered_fraction if coverage else 0.0, width=60)
+        )
+        rows.add_row(Text(target_text(self._recorder), overflow="ellipsis"))
         if self._page:
-            lines.append(Text(f"status  {self._page}", style="dim"))
-        return Group(*lines)
+            rows.add_row(Text(f"status  {self._page}", style="dim"))
+        return rows
 
 
 def summary_table(result: Mapping[str, Any]) -> Table:

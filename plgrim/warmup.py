@@ -40,7 +40,9 @@ def rehearse(mission_s: float = REHEARSAL_S) -> None:
 
     try:
         Lockstep({"sim": {"world": "maze"}}, seed=1).run_until(int(mission_s * SECOND_NS))
-    except Exception as error:  # what compiles late only costs time: the mission itself will say what is wrong
+    except (
+        Exception
+    ) as error:  # what compiles late only costs time: the mission itself will say what is wrong
         print(f"kernels: the rehearsal failed: {type(error).__name__}: {str(error)[:300]}", file=sys.stderr)
 
 

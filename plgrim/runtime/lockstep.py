@@ -6,13 +6,14 @@ they would be on the robot; without latency, reconciliation would have nothing t
 
 from __future__ import annotations
 
-import hashlib
 import heapq
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
+
+import xxhash
 
 from plgrim.registry import STAGES, make_stage
 from plgrim.runtime.mailbox import Mailbox, Outbox
@@ -51,7 +52,7 @@ class Lockstep:
     ) -> None:
         self.now: Stamp = 0
         self._observer = observer
-        self._hash = hashlib.sha256()
+        self._hash = xxhash.xxh3_128()
         self._order = 0
         self._pending: list[tuple[Stamp, int, Topic[Message], bytes]] = []
         self._runners: dict[str, _Runner] = {}

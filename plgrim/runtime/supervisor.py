@@ -219,28 +219,28 @@ class Supervisor:
     def shutdown(self) -> None:
         """End the services, last started first, then the router; kill what does not end in time."""
         grace = self.config.runtime.stop_timeout_s
-        _end([child.process for child in reversed(self._services()) if child.process], grace)
+        _end(list(reversed(self._services())), grace)
         if self.link is not None:
             self.link.close()
             self.link = None
-        router = self.children[ROUTER].process
-        _end([router] if router else [], grace)
-        for child in self.children.values():
-            child.process = None
+        _end([self.children[ROUTER]], grace)
 
 
-def _end(processes: list[subprocess.Popen[bytes]], grace_s: float) -> None:
-    for process in processes:
+def _end(children: list[Child], grace_s: float) -> None:
+    running = {child.name: child.process for child in children if child.process}
+    for process in running.values():
         if process.poll() is None:
             process.terminate()
     deadline = time.monotonic() + grace_s
-    for process in processes:
+    for name, process in running.items():
         try:
             process.wait(max(0.0, deadline - time.monotonic()))
         except subprocess.TimeoutExpired:
-            get_logger().warning("did not end in time: killed", pid=process.pid)
+            get_logger().warning("did not end in time: killed", child=name)
         _signal_group(process, signal.SIGKILL)  # also what it may have started
         process.wait()
+    for child in children:
+        child.process = None
 
 
 def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+import math
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+_MAX_REACH = 15
+"""Nodes that a row of sight in a `LocalIrm` holds to either side."""
 
 
 class Config(BaseModel):
@@ -36,10 +41,19 @@ class Config(BaseModel):
     # frontiers
     frontier_block_m: float = Field(5.0, ge=1, le=50, description="A frontier is no longer than about this, m.")
     frontier_reach_m: float = Field(8.0, ge=1, le=50, description="Ground up to here counts for a frontier, m.")
-    frontier_min_gain: float = Field(0.1, gt=0, le=10, description="Less is not a frontier, nats of patches.")
+    frontier_min_gain: float = Field(0.2, gt=0, le=10, description="Less is not a frontier, nats of patches.")
     frontier_same_m: float = Field(2.5, ge=0, le=20, description="A frontier this near to an old one is that one.")
-    unknown_depth_m: float = Field(2.0, ge=0, le=20, description="Unknown ground expected behind a border, m.")
-    give_up_s: float = Field(12.0, gt=0, le=600, description="Time beside a frontier that yields nothing, s.")
+    unknown_depth_m: float = Field(1.0, ge=0, le=20, description="Unknown ground expected behind a border, m.")
+    unknown_max_gain: float = Field(3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats.")
+    give_up_s: float = Field(6.0, gt=0, le=600, description="Time beside a frontier that yields nothing, s.")
     give_up_radius_m: float = Field(1.5, gt=0, le=10, description="How near that is, m.")
     retry_after_s: float = Field(600.0, gt=0, le=1e5, description="A given-up frontier may come back then, s.")
     blocked_memory_s: float = Field(60.0, gt=0, le=1e4, description="Where the robot was blocked stays risky, s.")
+
+    @model_validator(mode="after")
+    def _fits_the_message(self) -> Config:
+        if math.ceil(self.sensor_range_m / self.spacing_m) > _MAX_REACH:
+            raise ValueError(f"sensor_range_m: its range is more than {_MAX_REACH} times spacing_m")
+        if self.size % 2 == 0:
+            raise ValueError(f"size: {self.size} is not odd, there is no middle node")
+        return self

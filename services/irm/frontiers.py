@@ -148,14 +148,24 @@ def find_frontiers(window: Window, config: Config) -> list[tuple[float, float, f
         return []
     reach = round(config.frontier_reach_m / s.resolution_m)
     spread_blocks(window.uncovered, block, reach, blocks)
-    gain, sums = np.zeros(blocks), np.zeros((blocks, 4))
+    gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
+    block_gains(window.entropy, solid_unknown(window.state), block, gain, sums, hidden)
     unknown_gain = config.unknown_depth_m * s.resolution_m * LOG_2 / config.spacing_m**2
-    block_gains(window.entropy, window.state == UNKNOWN, block, unknown_gain, gain, sums)
+    gain += np.minimum(hidden * unknown_gain, config.unknown_max_gain)
     places = block_places(window.free_space, block, sums, round(1.0 / s.resolution_m))
     piece_of = np.zeros(blocks, np.int64)
     inside = block >= 0
     piece_of[block[inside]] = labels[inside]
     return _select(gain, places, piece_of, window, config)
+
+
+def solid_unknown(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Unknown cells in the midst of unknown cells (6 of 9): gaps between far rays are not unexplored ground."""
+    unknown = state == UNKNOWN
+    padded = np.pad(unknown, 1, mode="edge").astype(np.uint8)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    solid: NDArray[np.bool_] = unknown & (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] >= 6)
+    return solid
 
 
 def _select(
@@ -269,13 +279,13 @@ def block_gains(
     entropy: NDArray[np.float32],
     unknown: NDArray[np.bool_],
     block: NDArray[np.int32],
-    unknown_gain: float,
     gain: NDArray[np.float64],
     sums: NDArray[np.float64],
+    hidden: NDArray[np.float64],
 ) -> None:
-    """Expected information gain of each block: entropy of its cells, and of the unknown that they border on.
+    """Entropy of each block's cells, and how many of them border on the unknown (hidden).
 
-    sums: (blocks, 4): number of cells, sum of rows, sum of columns, unused.
+    sums: (blocks, 3): number of cells, sum of rows, sum of columns.
     """
     height, width = block.shape
     for row in range(height):
@@ -294,7 +304,7 @@ def block_gains(
                 or (column < width - 1 and unknown[row, column + 1])
             )
             if near_unknown:
-                gain[b] += unknown_gain
+                hidden[b] += 1.0
 
 
 @njit

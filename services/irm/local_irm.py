@@ -77,6 +77,14 @@ class LocalIrmBuilder:
             visible=self._visible(window, anchor, state, entropy, ix0, iy0, reach),
         )
 
+    def state(self) -> list[list[float]]:
+        """For a snapshot: lattice index and place of each anchor."""
+        return [[*index, *place] for index, place in sorted(self._anchors.items())]
+
+    def set_state(self, state: list[list[float]]) -> None:
+        """From a snapshot."""
+        self._anchors = {(int(ix), int(iy)): (x, y) for ix, iy, x, y in state}
+
     def _anchor(self, window: Window, ix0: int, iy0: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         c, s = self.config, window.spec
         n = c.size * c.size
@@ -124,18 +132,22 @@ class LocalIrmBuilder:
         reach: int,
     ) -> NDArray[np.uint32]:
         c, s = self.config, window.spec
-        half = (s.height // 2, s.width // 2)
+        # Halves of even global index, so that what a node sees does not change as the window rolls.
+        skip_x, skip_y = s.ix0 % 2, s.iy0 % 2
+        ix, iy = s.ix0 + skip_x, s.iy0 + skip_y
+        half = ((s.height - skip_y) // 2, (s.width - skip_x) // 2)
         opaque, mass = np.zeros(half, np.bool_), np.zeros(half, np.float32)
-        halve(window.state != 1, window.entropy * window.uncovered, opaque, mass)
+        part = (slice(skip_y, None), slice(skip_x, None))
+        halve(window.state[part] != 1, window.entropy[part] * window.uncovered[part], opaque, mass)
         rows = np.zeros((c.size * c.size, 2 * reach + 1), np.uint32)
         res = 2.0 * s.resolution_m
-        column = np.floor(((s.ix0 + 2 * np.arange(half[1]) + 1.0) * s.resolution_m) / c.spacing_m) - ix0
-        row = np.floor(((s.iy0 + 2 * np.arange(half[0]) + 1.0) * s.resolution_m) / c.spacing_m) - iy0
+        column = np.floor(((ix + 2 * np.arange(half[1]) + 1.0) * s.resolution_m) / c.spacing_m) - ix0
+        row = np.floor(((iy + 2 * np.arange(half[0]) + 1.0) * s.resolution_m) / c.spacing_m) - iy0
         patch = row[:, None] * c.size + column[None, :]
         outside = ((row < 0) | (row >= c.size))[:, None] | ((column < 0) | (column >= c.size))[None, :]
         patch[outside] = -1
         visible_rows(
-            opaque, mass, patch.astype(np.int32), s.ix0 * s.resolution_m, s.iy0 * s.resolution_m, res,
+            opaque, mass, patch.astype(np.int32), ix * s.resolution_m, iy * s.resolution_m, res,
             c.sensor_range_m, c.size, reach, state, anchor, entropy > 0.0, rows,
         )  # fmt: skip
         return rows
@@ -175,8 +187,9 @@ def visible_rows(
                 near += 1 if wanted[r * size + c] else 0
         if near == 0:
             continue
-        x = (anchor_m[node, 0] - x0_m) / resolution_m
-        y = (anchor_m[node, 1] - y0_m) / resolution_m
+        # Anchors are centres of cells, quarters of these: exact, since rays that graze a corner hang on the last bit.
+        x = round(4.0 * (anchor_m[node, 0] - x0_m) / resolution_m) / 4.0
+        y = round(4.0 * (anchor_m[node, 1] - y0_m) / resolution_m) / 4.0
         visible_mass(opaque, mass, x, y, range_m / resolution_m, patch_of, seen)
         for r in range(max(0, own_row - reach), min(size, own_row + reach + 1)):
             for c in range(max(0, own_column - reach), min(size, own_column + reach + 1)):

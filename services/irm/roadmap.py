@@ -162,8 +162,11 @@ class Roadmap:
         if not window.spec.contains(*cell):
             return
         search.run(cell, self.config.max_edge_m)
-        for other in sorted(self.graph.neighbors(node)):
-            if other != ROBOT and self.graph.nodes[other]["kind"] == BREADCRUMB:
+        # Its neighbours and what lies nearest: an edge that went comes back when its ground is free again.
+        around = sorted(self._near(*self._place(node), self.config.max_edge_m, BREADCRUMB))
+        others = {n for _, n in around[: self.config.edges_per_node + 1]} | set(self.graph.neighbors(node))
+        for other in sorted(others - {node, ROBOT}):
+            if self.graph.nodes[other]["kind"] == BREADCRUMB:
                 self._join(node, other, search)
 
     def _near(self, x_m: float, y_m: float, radius_m: float, kind: int | None) -> list[tuple[float, int]]:
@@ -181,6 +184,7 @@ class Roadmap:
 
     def message(self, pose: Pose, map_to_odom: Pose, stamp_ns: int, whole: bool) -> GlobalIrm:
         """The graph as a message: whole, or what has changed since the last message."""
+        whole = whole or not self._published
         before = {} if whole else self._published
         now = self._contents()
         nodes = [(k, v) for k, v in now.items() if isinstance(k, int) and before.get(k) != v]
@@ -229,7 +233,7 @@ class Roadmap:
         """For a snapshot."""
         return {
             "nodes": [[n, dict(d)] for n, d in sorted(self.graph.nodes(data=True))],
-            "edges": [[a, b, dict(d)] for a, b, d in self.graph.edges(data=True)],
+            "edges": sorted([min(a, b), max(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
             "manager": self.manager.state(),
             "counters": [self.next_id, self.version, self.last_breadcrumb],
         }

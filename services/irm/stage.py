@@ -76,11 +76,11 @@ class IrmStage:
         """One round of Algorithm 1; nothing while the risk map or the pose is missing or stale."""
         self._pending += [r.message for r in inputs.new(COVERAGE_SCAN)]
         self._pending = self._pending[-_MAX_PENDING:]
+        self._read_pose_graph(inputs)
         risk, odometry = inputs.current(RISK_MAP), inputs.current(ODOMETRY)
         if risk is None or odometry is None:
             return []
         self._allocate(risk)
-        self._read_pose_graph(inputs)
         self._read_follower(now, inputs, odometry)
         self._add_scans(risk, odometry)
         window = self._window(risk, odometry, now)
@@ -111,8 +111,8 @@ class IrmStage:
             int(k): Planar(float(p[0]), float(p[1]), float(p[3]))
             for k, p in zip(graph.keyframe_id, graph.pose_in_map, strict=True)
         }
-        assert self._store is not None
-        self._store.follow(self._keyframes)
+        if self._store is not None:
+            self._store.follow(self._keyframes)
 
     def _read_follower(self, now: Stamp, inputs: Inputs, odometry: Odometry) -> None:
         """Where the robot was blocked or stuck, the ground ahead is riskier than it looks."""
@@ -146,7 +146,9 @@ class IrmStage:
         )  # fmt: skip
 
     def _global(self, now: Stamp, window: Window, odometry: Odometry, whole: bool) -> Outputs:
-        elapsed = min((now - self._global_ns) / SECOND_NS, 10.0)
+        # Neither the first round nor a gap in the inputs is time that the robot stood beside a frontier.
+        since = (now - self._global_ns) / SECOND_NS
+        elapsed = min(since, 2.0 * self._config.global_period_s) if self._global_ns >= 0 else 0.0
         self._global_ns = now
         place = planar(odometry.map_to_odom).compose(planar(odometry.pose))
         self._roadmap.update(window, place.x_m, place.y_m, now, elapsed)
@@ -201,6 +203,8 @@ class IrmStage:
             "roadmap": self._roadmap.state(),
             "keyframes": [[k, *p] for k, p in sorted(self._keyframes.items())],
             "penalties": self._penalties,
+            "pending": [scan.model_dump() for scan in self._pending],
+            "anchors": self._local.state() if self._local else [],
             "global_ns": self._global_ns,
             "resolution": self._ground.resolution_m if self._ground else 0.0,
             "radius": self._local.footprint_radius_m if self._local else 0.0,
@@ -217,6 +221,7 @@ class IrmStage:
         self._roadmap.set_state(state["roadmap"])
         self._keyframes = {int(k): Planar(x, y, yaw) for k, x, y, yaw in state["keyframes"]}
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
+        self._pending = [CoverageScan(**scan) for scan in state["pending"]]
         self._global_ns = state["global_ns"]
         if state["resolution"]:
             self._ground = TileLayer("uint8", 0, state["resolution"])
@@ -226,3 +231,4 @@ class IrmStage:
             self._store = FootprintStore(self._coverage)
             self._store.set_state(state["footprints"])
             self._local = LocalIrmBuilder(self._config, state["radius"], state["version"])
+            self._local.set_state(state["anchors"])

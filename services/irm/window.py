@@ -23,8 +23,8 @@ class Window:
     """What is known around the robot, all (h, w) over `spec` in `map`.
 
     passable: the robot's centre fits. free_space: passable and connected to the robot. ground: what its body can
-    touch from there. uncovered: ground below the covered probability. entropy: of ground cells, nats of whole
-    patches (0 elsewhere). hazard: mean hazard rate under the body, 1/m. step_cost: cost per metre of the grid search.
+    touch from there. uncovered: ground below the covered probability, slivers of one cell left out. entropy: of
+    uncovered cells, nats of whole patches (0 elsewhere). hazard: mean hazard rate under the body, 1/m. step_cost: cost per metre of the grid search.
     """
 
     spec: GridSpec
@@ -74,8 +74,9 @@ def build_window(
     ground |= before & (risk.state == UNKNOWN)
     ground_layer.write(spec, np.where(ground, 1, 0).astype(np.uint8))
     p = probability(coverage_layer.read(spec))
+    uncovered = without_slivers(ground & (p < config.covered_probability))
     cell_share = (g.resolution_m / config.spacing_m) ** 2
-    cell_entropy = np.where(ground, entropy(p) * np.float32(cell_share), np.float32(0.0))
+    cell_entropy = np.where(uncovered, entropy(p) * np.float32(cell_share), np.float32(0.0))
     return Window(
         spec=spec,
         state=risk.state,
@@ -84,7 +85,7 @@ def build_window(
         step_cost=_step_cost(hazard, risk.clearance_m, needed, config.comfort_clearance_m),
         free_space=free_space,
         ground=ground,
-        uncovered=ground & (p < config.covered_probability),
+        uncovered=uncovered,
         probability=p,
         entropy=cell_entropy,
         robot_cell=robot,
@@ -126,6 +127,21 @@ def connected_free_space(passable: NDArray[np.bool_], robot: tuple[int, int]) ->
             if int(reached.sum()) > 4:
                 break
     return reached
+
+
+def without_slivers(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The mask without cells that lie in strips of one cell: such strips beside walls are how the grid falls.
+
+    A cell stays when at least 6 of the 9 cells around it (itself included) are in the mask, or when it touches one
+    that stays.
+    """
+    padded = np.pad(mask, 1).astype(np.uint8)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    core = mask & (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] >= 6)
+    grown = np.pad(core, 1)
+    near = grown[:-2] | grown[1:-1] | grown[2:]
+    kept: NDArray[np.bool_] = mask & (near[:, :-2] | near[:, 1:-1] | near[:, 2:])
+    return kept
 
 
 @njit

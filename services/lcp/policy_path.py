@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from planning.coverage_model import (
     MACRO_STEPS,
+    MAX_EDGE_RISK,
     SWEEP,
     SWEEP_STEPS,
     CoverageModel,
@@ -50,15 +51,17 @@ def likely_moves(
 def _unfold(
     model: CoverageModel, action: int, node: int, heading: int, covered: NDArray[np.uint64]
 ) -> list[int]:
-    """The single moves of an action when nothing is blocked."""
-    if action < 8:
-        return [action]
+    """The single moves of an action when nothing is blocked.
+
+    None where this node has no such edge: the actions of a history are those of its first particle, which may stand on
+    another node than the junction.
+    """
     if action == SWEEP:
         rest = np.zeros(SWEEP_STEPS, np.int64)
         return [int(k) for k in rest[: follow_rule(model, node, heading, covered.copy(), rest)]]
-    moves = []
-    k = action % 8
-    while len(moves) < MACRO_STEPS and node >= 0 and model.edge_distance_m[node, k] > 0.0:
+    moves: list[int] = []
+    k, most = action % 8, 1 if action < 8 else MACRO_STEPS
+    while len(moves) < most and model.edge_distance_m[node, k] > 0.0 and model.edge_risk[node, k] <= MAX_EDGE_RISK:
         moves.append(k)
         node = neighbour(node, k, model.size)
     return moves

@@ -28,6 +28,7 @@ from services.lcp.problem import (
     local_entropy,
     node_at,
     planar,
+    weighted_entropy,
 )
 
 __all__ = ["Config", "LcpStage", "create", "spec"]
@@ -130,7 +131,8 @@ class LcpStage:
         policy: GlobalPolicy | None,
     ) -> LocalPolicy:
         leaf = leaf_values(irm, policy, self._config.weights)
-        model = coverage_model(irm, entropy, leaf, junction, self._config)
+        counted = weighted_entropy(irm, entropy, self._config)
+        model = coverage_model(irm, counted, leaf, junction, self._config)
         seed = int(stream(self._seed, "lcp", request.episode).integers(2**63))
         report = self._solver.search(
             search_coverage, model, seed=seed, simulations=request.simulations, should_stop=self._deadline()
@@ -140,6 +142,10 @@ class LcpStage:
         if not moves:
             return self._guide(now, request, irm, junction, policy)
         root = self._solver.root()
+        if root.best_value - leaf[junction.node] < self._config.cover_min_value:
+            guided = self._guide(now, request, irm, junction, policy)
+            if guided.phase == LocalPhase.GUIDE:
+                return guided
         reason = f"covers: value {root.best_value:.2f} by {report.simulations} simulations"
         return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, moves, in_tree, tree,
                        float(root.best_value), report.simulations, report.nodes)  # fmt: skip

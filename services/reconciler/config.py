@@ -19,7 +19,7 @@ class Config(BaseModel):
     )
     weights: RewardWeights = RewardWeights()
     # episodes
-    episode_period_s: float = Field(1.0, ge=0.2, le=20, description="Time between planning episodes, s.")
+    episode_period_s: float = Field(1.5, ge=0.2, le=20, description="Time between planning episodes, s.")
     episode_timeout_s: float = Field(3.0, ge=0.5, le=60, description="An unanswered episode is dropped then, s.")
     simulations: int = Field(4096, ge=1, le=10_000_000, description="POMCP simulations of an episode.")
     horizon_m: float = Field(30.0, gt=1, le=1000, description="Travel that a policy looks ahead, m.")
@@ -29,6 +29,7 @@ class Config(BaseModel):
     max_kept_m: float = Field(8.0, gt=0, le=100, description="No more of the old path is kept, m.")
     regulariser: float = Field(0.3, ge=0, le=100, description="lambda: weight of the mismatch at the junction.")
     replan_rollouts: int = Field(16, ge=1, le=1000, description="Rollouts for the value of replanning.")
+    rollout_moves: int = Field(40, ge=1, le=500, description="Moves of those rollouts.")
     # motion limits
     max_speed_mps: float = Field(1.0, gt=0, le=10, description="Speed limit, m/s.")
     min_speed_mps: float = Field(0.25, gt=0, le=10, description="Speed in the narrowest places, m/s.")

@@ -101,7 +101,7 @@ def model_here(irm: LocalIrm, node: int, heading: int, covered: NDArray[np.uint6
         leaf_value=np.zeros(irm.size * irm.size),
         root=root,
         weights=parameters(config.weights),
-        rollout_steps=24,
+        horizon=config.rollout_moves,
         rollout_random=0.0,
     )
 

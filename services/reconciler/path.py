@@ -124,7 +124,7 @@ def _may_skip(
         leg = segment_min_clearance(
             clearance_m, resolution_m, ix0, iy0, points[m, 0], points[m, 1], points[m + 1, 0], points[m + 1, 1]
         )
-        needed = min(needed, leg - 0.01)
+        needed = min(needed, leg - 0.004)
     return segment_min_clearance(clearance_m, resolution_m, ix0, iy0, x0, y0, x1, y1) >= needed
 
 
@@ -147,8 +147,15 @@ def relax(
     rounds: int,
     radius_m: float,
 ) -> None:
-    """Round the corners of a line and push it off walls, in place; its ends stay."""
+    """Round the corners of a line and push it off walls, in place; its ends stay.
+
+    No point comes to have less clearance than it began with (or than is comfortable), but for a few millimetres; nor
+    less than the radius where it had more, nor any less where it had not even that.
+    """
     h = resolution_m
+    floor_m = np.empty(line.shape[0])
+    for i in range(line.shape[0]):
+        floor_m[i] = min(clearance_at(clearance_m, h, ix0, iy0, line[i, 0], line[i, 1]), comfort_m) - 0.004
     for _ in range(rounds):
         for i in range(1, line.shape[0] - 1):
             x, y = line[i, 0], line[i, 1]
@@ -164,7 +171,7 @@ def relax(
                     nx += push * gx / norm
                     ny += push * gy / norm
             after = clearance_at(clearance_m, h, ix0, iy0, nx, ny)
-            if after >= min(before, comfort_m) - 0.004 and after >= min(before, radius_m):
+            if after >= floor_m[i] and after >= min(before, radius_m):
                 line[i, 0], line[i, 1] = nx, ny
 
 

@@ -30,11 +30,12 @@ class SafetyInputs(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """The safety state, why, and whether the robot may move."""
+    """The safety state, why, whether the robot may move, and whether it has to be slow (a return can be degraded)."""
 
     state: SafetyState
     reason: str
     may_move: bool
+    slow: bool
 
 
 def judge(limits: SafetyLimits, inputs: SafetyInputs) -> Verdict:
@@ -44,10 +45,11 @@ def judge(limits: SafetyLimits, inputs: SafetyInputs) -> Verdict:
     """
     asked = [*_stale(limits, inputs), *_mission(inputs.phase)]
     if not asked:
-        return Verdict(SafetyState.RUN, "", True)
+        return Verdict(SafetyState.RUN, "", True, False)
     state, reason = max(asked, key=lambda entry: _SEVERITY.index(entry[0]))
     stops = [r for s, r in asked if s in (SafetyState.HOLD, SafetyState.DONE)]
-    return Verdict(state, "; ".join(stops) if stops else reason, not stops)
+    slow = any(s == SafetyState.DEGRADED for s, _ in asked)
+    return Verdict(state, "; ".join(stops) if stops else reason, not stops, slow)
 
 
 def _stale(limits: SafetyLimits, inputs: SafetyInputs) -> list[tuple[SafetyState, str]]:

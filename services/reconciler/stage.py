@@ -10,7 +10,7 @@ from planning.coverage_model import rollout_value
 from planning.grid import GridSpec
 from planning.pomcp import random_stream
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
-from schemas.policy import EpisodeRequest, LocalPhase, LocalPolicy, Plan, SafetyState
+from schemas.policy import EpisodeRequest, LocalPhase, LocalPolicy, Plan
 from schemas.sensing import FollowerState, Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import EPISODE, FOLLOWER, LOCAL_IRM, LOCAL_POLICY, MISSION, ODOMETRY, PLAN, RISK_MAP
@@ -31,7 +31,6 @@ from services.reconciler.episode import (
 from services.reconciler.path import (
     STEP_M,
     Ground,
-    arc_lengths,
     first_hazard,
     headings,
     project,
@@ -72,13 +71,14 @@ class ReconcilerStage:
         self._end = 0
         self._episode = 0
         self._opened_ns = -(10**18)
-        self._answered_ns = 0
+        self._asked_ns = -1
         self._plan_id = 0
         self._published_ns = -(10**18)
         self._changed = False
+        self._slow = False
         self._why = "starting"
         self._tau_s = 0.0
-        self._kept_m = 0.0
+        self._kept_end = 0
         self._trouble_ns = -1
         self._value_ratio = 1.0
         self._plan: Plan | None = None
@@ -87,6 +87,8 @@ class ReconcilerStage:
         """One cycle: safety first, then the path, then episodes."""
         odometry, risk = inputs.latest(ODOMETRY), inputs.latest(RISK_MAP)
         verdict = self._judge(now, inputs)
+        if not verdict.may_move:
+            self._asked_ns = -1
         if odometry is None or risk is None:
             return []
         g = risk.message.grid
@@ -111,7 +113,7 @@ class ReconcilerStage:
     def _judge(self, now: Stamp, inputs: Inputs) -> Verdict:
         c = self._config
         mission = inputs.current(MISSION)
-        waiting = (now - self._answered_ns) / SECOND_NS if self._opened is not None else 0.0
+        waiting = (now - self._asked_ns) / SECOND_NS if self._asked_ns >= 0 else 0.0
         return judge(
             SafetyLimits(c.risk_stale_s, c.odometry_stale_s, c.irm_stale_s, c.policy_silent_s),
             SafetyInputs(
@@ -187,7 +189,8 @@ class ReconcilerStage:
             self._why = "no node of the Local IRM in reach"
             return []
         self._opened, request = opened
-        self._answered_ns = max(self._answered_ns, now)
+        if self._asked_ns < 0:  # else lcp owes an answer since an earlier episode
+            self._asked_ns = now
         return [Output(EPISODE, request)]
 
     def _keep_prefix(
@@ -304,9 +307,10 @@ class ReconcilerStage:
     def _install(self, now: Stamp, policy: LocalPolicy, odometry: Odometry, ground: Ground) -> None:
         """Concatenate the kept prefix and the new policy (Eq. 15); answers to other episodes are dropped."""
         opened = self._opened
+        self._asked_ns = -1
         if opened is None or policy.episode != opened.number:
             return
-        self._opened, self._answered_ns = None, now
+        self._opened = None
         if policy.phase == LocalPhase.NONE or len(policy.path_lattice) == 0:
             self._why = policy.reason
             return
@@ -332,7 +336,7 @@ class ReconcilerStage:
         self._at, _ = project(points, odometry.pose.x_m, odometry.pose.y_m, 0, min(40, len(points) - 1))
         self._end = len(points) - 1
         self._tau_s = opened.tau_s
-        self._kept_m = float(arc_lengths(prefix)[-1]) if opened.keeps_old and len(prefix) else 0.0
+        self._kept_end = len(prefix) if opened.keeps_old else 0
         self._changed = True
 
     # --- motion -------------------------------------------------------------------------------------------------
@@ -344,14 +348,15 @@ class ReconcilerStage:
         moving = verdict.may_move and self._committed is not None
         was_moving = self._plan is not None and self._plan.valid
         state_changed = self._plan is None or self._plan.safety != verdict.state or was_moving != moving
+        state_changed = state_changed or self._slow != verdict.slow
         due = now - self._published_ns >= 0.3 * SECOND_NS
         if not (self._changed or state_changed or due):
             return []
         if self._changed or state_changed:
             self._plan_id += 1
-        share = self._config.degraded_speed_share if verdict.state == SafetyState.DEGRADED else 1.0
+        share = self._config.degraded_speed_share if verdict.slow else 1.0
         self._plan = self._make_plan(now, verdict, odometry, ground, risk_stamp_ns, moving, share)
-        self._changed, self._published_ns = False, now
+        self._changed, self._published_ns, self._slow = False, now, verdict.slow
         return [Output(PLAN, self._plan)]
 
     def _make_plan(
@@ -364,9 +369,9 @@ class ReconcilerStage:
         moving: bool,
         share: float,
     ) -> Plan:
-        points = _NO_POINTS
+        points, first = _NO_POINTS, max(self._at - 1, 0)
         if moving and self._committed is not None:
-            points = self._committed.points[max(self._at - 1, 0) : self._end + 1]
+            points = self._committed.points[first : self._end + 1]
         speed, time_s = speeds(points, odometry.speed_mps, ground, self._config, share)
         return Plan(
             stamp_ns=now,
@@ -376,7 +381,7 @@ class ReconcilerStage:
             safety=verdict.state,
             reason=verdict.reason or self._why,
             tau_s=self._tau_s,
-            kept_points=min(len(points), round(self._kept_m / STEP_M)),
+            kept_points=min(len(points), max(self._kept_end - first, 0)),
             ttl_s=self._config.plan_ttl_s,
             risk_stamp_ns=risk_stamp_ns,
             x_m=np.ascontiguousarray(points[:, 0]),

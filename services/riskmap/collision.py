@@ -48,9 +48,9 @@ def collision_layers(
     state[log_odds < -free_log_odds] = FREE
     state[log_odds > 0.0] = LETHAL
     p = 1.0 / (1.0 + np.exp(-log_odds))
+    p[state == UNKNOWN] = 0.5
     floor = 1.0 / (1.0 + math.exp(clamp_log_odds))
     p = np.clip((p - floor) / (1.0 - floor), 0.0, 1.0)
-    p[state == UNKNOWN] = 0.5
     mean = (hazard_per_m * p).astype(np.float32)
     variance = (hazard_per_m**2 * p * (1.0 - p)).astype(np.float32)
     cvar = np.minimum(mean + cvar_factor(alpha) * np.sqrt(variance), hazard_per_m).astype(np.float32)
@@ -71,7 +71,8 @@ def stamp_clearance(
     """Distance from each cell's centre to the nearest lethal point, up to a maximum; 0 in lethal cells.
 
     Exact for the points (mean hits inside lethal cells), unlike a distance transform of whole cells: a door of 0.8 m
-    must not lose a cell on either side. Cells that lethal cells surround on all four sides cannot be the nearest.
+    must not lose a cell on either side. Cells that lethal cells surround on all eight sides are left out: they are the
+    nearest by a tenth of a cell at most.
     """
     height, width = lethal.shape
     reach = math.ceil(max_clearance_m / resolution_m) + 1
@@ -87,6 +88,10 @@ def stamp_clearance(
                 and lethal[row + 1, column]
                 and lethal[row, column - 1]
                 and lethal[row, column + 1]
+                and lethal[row - 1, column - 1]
+                and lethal[row - 1, column + 1]
+                and lethal[row + 1, column - 1]
+                and lethal[row + 1, column + 1]
             ):
                 continue
             ox, oy = offset_x[row, column], offset_y[row, column]

@@ -83,7 +83,9 @@ def integrate_sweep(
         above = sensor[2] + pz - heights_m[0]
         reach = distance
         if above > heights_m[2]:
-            reach = distance * (heights_m[2] + heights_m[0] - sensor[2]) / pz
+            # A sensor above the robot sees such points over its head: nothing is known of the ground below.
+            room = heights_m[2] + heights_m[0] - sensor[2]
+            reach = distance * room / pz if room > 0.0 else 0.0
         elif above > heights_m[1]:
             _add_hit(sensor[0] + dx, sensor[1] + dy, evidence, resolution_m, ix0, iy0, log_odds, hit_weight, hit_x, hit_y, hit_now)  # fmt: skip  # noqa: E501
         bearing = int((math.atan2(dy, dx) / (2.0 * math.pi) + 1.0) * _BEARINGS) % _BEARINGS
@@ -132,15 +134,22 @@ def _clear_passed(
     hit_weight: NDArray[np.float32],
     hit_now: NDArray[np.uint8],
 ) -> None:
-    """Cells that rays went through are evidence of nothing there, once a sweep, unless the sweep hit them too."""
+    """Cells that rays went through are evidence of nothing there, once a sweep, unless the sweep hit them too.
+
+    Between two bearings the shorter of both counts too, so that far away no cell is missed between the rays.
+    """
     height, width = log_odds.shape
     passed = hit_now
     x0, y0 = sensor[0] / resolution_m - ix0, sensor[1] / resolution_m - iy0
-    for bearing in range(free_range.shape[0]):
-        length = free_range[bearing] / resolution_m - 0.5
+    count = free_range.shape[0]
+    for half in range(2 * count):
+        reach = free_range[half // 2]
+        if half % 2 == 1:
+            reach = min(reach, free_range[(half // 2 + 1) % count])
+        length = reach / resolution_m - 0.5
         if length <= 0.0:
             continue
-        angle = 2.0 * math.pi * (bearing + 0.5) / free_range.shape[0]
+        angle = math.pi * (half + 1.0) / count
         dx, dy = math.cos(angle), math.sin(angle)
         column, row = math.floor(x0), math.floor(y0)
         step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from services.riskmap.occupancy import OccupancyWindow
 from schemas.sensing import ReadyGrid
@@ -15,32 +16,32 @@ def apply_ready_grid(grid: ReadyGrid, window: OccupancyWindow, clamp_log_odds: f
 
     Grids of any resolution and origin are taken; -1 leaves what the window knows.
     """
-    spec = window.spec
-    rows_of = _index_range(spec.iy0, spec.height, spec.resolution_m, grid.origin_y_m, grid.resolution_m)
-    columns_of = _index_range(spec.ix0, spec.width, spec.resolution_m, grid.origin_x_m, grid.resolution_m)
-    for row, (r0, r1) in enumerate(rows_of):
-        r0, r1 = max(r0, 0), min(r1, grid.height)
-        if r0 >= r1:
-            continue
-        band = grid.occupancy[r0:r1].max(axis=0)
-        for column, (c0, c1) in enumerate(columns_of):
-            c0, c1 = max(c0, 0), min(c1, grid.width)
-            if c0 >= c1:
-                continue
-            percent = int(band[c0:c1].max())
-            if percent >= 0:
-                p = min(max(percent / 100.0, 1e-6), 1.0 - 1e-6)
-                window.log_odds[row, column] = np.clip(math.log(p / (1.0 - p)), -clamp_log_odds, clamp_log_odds)
-                window.hit_weight[row, column] = 0.0
+    s = window.spec
+    rows = _index_ranges(s.iy0, s.height, s.resolution_m, grid.origin_y_m, grid.resolution_m)
+    columns = _index_ranges(s.ix0, s.width, s.resolution_m, grid.origin_x_m, grid.resolution_m)
+    percent = _worst(_worst(grid.occupancy, *rows).T, *columns).T
+    known = percent >= 0
+    p = np.clip(percent / 100.0, 1e-6, 1.0 - 1e-6)
+    evidence = np.clip(np.log(p / (1.0 - p)), -clamp_log_odds, clamp_log_odds)
+    window.log_odds[known] = evidence[known]
+    for hits in (window.hit_weight, window.hit_x, window.hit_y):  # a grid says nothing about where in the cell
+        hits[known] = 0.0
 
 
-def _index_range(
+def _index_ranges(
     first: int, count: int, resolution_m: float, origin_m: float, grid_resolution_m: float
-) -> list[tuple[int, int]]:
-    """For each window cell of one axis, the half-open range of grid cells that it overlaps."""
-    ranges = []
-    for i in range(count):
-        low = ((first + i) * resolution_m - origin_m) / grid_resolution_m
-        high = ((first + i + 1) * resolution_m - origin_m) / grid_resolution_m
-        ranges.append((math.floor(low + 1e-6), max(math.ceil(high - 1e-6), math.floor(low + 1e-6) + 1)))
-    return ranges
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """For each window cell of one axis, the half-open range (low, high) of grid cells that it overlaps."""
+    borders = ((first + np.arange(count + 1)) * resolution_m - origin_m) / grid_resolution_m
+    low = np.floor(borders[:-1] + 1e-6).astype(np.int64)
+    high = np.ceil(borders[1:] - 1e-6).astype(np.int64)
+    return low, np.maximum(high, low + 1)
+
+
+def _worst(values: NDArray[Any], low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Row i is the highest of the rows low[i] to high[i] of `values`; -1 where there are none."""
+    out = np.full((len(low), values.shape[1]), -1, dtype=np.int8)
+    low, high = np.clip(low, 0, len(values)), np.clip(high, 0, len(values))
+    for i in np.flatnonzero(low < high):
+        out[i] = values[low[i] : high[i]].max(axis=0)
+    return out

@@ -37,27 +37,27 @@ class RiskMapStage:
         self._window = OccupancyWindow(config.window_m, config.resolution_m)
         self._stamp_ns = -1
         self._published_ns = -(10**18)
+        self._news = False
         self._pose = Pose()
         self.bad_points = 0
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """Read the newest cloud or grid; give the risk map when its period has passed and it has news."""
-        changed = False
         odometry = inputs.latest(ODOMETRY)
         if odometry is not None:
             self._pose = odometry.message.pose
         for received in inputs.new(CLOUD):
             if received.age_ns <= self._config.cloud_timeout_s * SECOND_NS:
-                changed |= self._integrate(received.message)
+                self._news |= self._integrate(received.message)
         for received in inputs.new(READY_GRID):
             self._window.roll_to(self._pose.x_m, self._pose.y_m)
             apply_ready_grid(received.message, self._window, self._config.clamp_log_odds)
             self._stamp_ns = max(self._stamp_ns, received.message.stamp_ns)
-            changed = True
+            self._news = True
         due = now - self._published_ns >= self._config.publish_period_s * SECOND_NS - SECOND_NS // 100
-        if not changed or not due:
+        if not self._news or not due:
             return []
-        self._published_ns = now
+        self._published_ns, self._news = now, False
         return [Output(RISK_MAP, self._risk_map())]
 
     def _integrate(self, cloud: PointCloud) -> bool:
@@ -101,6 +101,7 @@ class RiskMapStage:
                 "spec": list(w.spec),
                 "layers": [w.log_odds, w.hit_weight, w.hit_x, w.hit_y],
                 "stamps": [self._stamp_ns, self._published_ns],
+                "news": self._news,
                 "pose": self._pose.model_dump(),
             }
         )
@@ -112,6 +113,7 @@ class RiskMapStage:
         w.spec = GridSpec(*state["spec"])
         w.log_odds, w.hit_weight, w.hit_x, w.hit_y = state["layers"]
         self._stamp_ns, self._published_ns = state["stamps"]
+        self._news = bool(state["news"])
         self._pose = Pose(**state["pose"])
 
 

@@ -58,7 +58,7 @@ class Reference:
     @cached_property
     def _footprints(self) -> dict[tuple[int, int], frozenset[int]]:
         return {
-            (node, k): frozenset(other for other in self.sees[node] if self._in_wedge(node, other, k))
+            (node, k): frozenset(other for other in self.sees.get(node, ()) if self._in_wedge(node, other, k))
             for node in range(self.size**2)
             for k in range(8)
         }
@@ -116,7 +116,7 @@ class Reference:
         node: int = 0,
         heading: int = 0,
         covered: Iterable[int] = (),
-        rollout_steps: int = 24,
+        horizon: int = 40,
         rollout_random: float = 0.0,
     ) -> CoverageModel:
         """The compiled model of this problem."""
@@ -142,7 +142,7 @@ class Reference:
                 np.array([node], np.int32), np.array([heading], np.uint8), np.ones(1), self.bits(covered)
             ),
             weights=parameters(self.weights),
-            rollout_steps=rollout_steps,
+            horizon=horizon,
             rollout_random=rollout_random,
         )
 

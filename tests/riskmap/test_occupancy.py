@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -16,7 +16,7 @@ from schemas.base import Pose
 from services.riskmap.collision import RiskLayers, collision_layers
 from services.riskmap.config import Config
 from services.riskmap.occupancy import OccupancyWindow, integrate_sweep
-from tests.riskmap.helpers import SENSOR_Z_M, Wall, rectangle, sweep
+from tests.riskmap.helpers import SENSOR_Z_M, rectangle, sweep
 
 HIT, PASS, CLAMP = 1.2, 0.5, 4.0
 GROUND_M, BODY_M, SELF_M = 0.15, 0.9, 0.2
@@ -106,14 +106,15 @@ def _brute_force(
     low_x = (spec.ix0 + np.arange(spec.width)[None, :]) - x / spec.resolution_m
     low_y = (spec.iy0 + np.arange(spec.height)[:, None]) - y / spec.resolution_m
     sure, maybe = np.zeros(spec.shape, np.bool_), np.zeros(spec.shape, np.bool_)
-    for bearing in np.flatnonzero(reach / spec.resolution_m > 0.5):
-        angle = 2 * math.pi * (bearing + 0.5) / BEARINGS
+    reaches = np.stack((reach, np.minimum(reach, np.roll(reach, -1))), axis=1).ravel()  # and between two bearings
+    for half in np.flatnonzero(reaches / spec.resolution_m > 0.5):
+        angle = 2 * math.pi * (0.5 * half + 0.5) / BEARINGS
         enter = np.zeros(spec.shape)
         leave = np.full(spec.shape, np.inf)
         for low, slope in ((low_x, math.cos(angle)), (low_y, math.sin(angle))):
             a, b = low / slope, (low + 1.0) / slope
             enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
-        length = reach[bearing] / spec.resolution_m - 0.5
+        length = reaches[half] / spec.resolution_m - 0.5
         sure |= (leave - enter > 1e-6) & (enter < length - 1e-6)
         maybe |= (leave - enter > -1e-6) & (enter < length + 1e-6)
     return hit, sure, maybe
@@ -225,7 +226,7 @@ def test_a_moved_obstacle_fades_and_the_clearance_comes_back() -> None:
     pose = Pose(z_m=SENSOR_Z_M)
     for _ in range(40):
         integrate(window, sweep([*walls, *crate], pose))
-    cell = window.spec.cell_of(0.7, 0.05)
+    cell = window.spec.cell_of(0.75, 0.05)
     near = layers_of(window)
     assert near.clearance_m[cell] == pytest.approx(0.25, abs=0.03)
     needed = 0
@@ -246,22 +247,13 @@ def test_evidence_is_bounded() -> None:
     assert window.log_odds.min() == pytest.approx(-CLAMP)
 
 
-def _door(low: float, high: float, x: float = 2.0, thick: float = 0.2) -> list[Wall]:
-    """Two rooms joined by a door from y = low to y = high in a wall of some thickness."""
-    return [
-        *rectangle(-2.0, -2.0, x, low),
-        *rectangle(-2.0, high, x, 3.0),
-        (x, low, x + thick, low),
-        (x, high, x + thick, high),
-        (x + thick, low, x + thick, -2.0),
-        (x + thick, high, x + thick, 3.0),
-        (x + 3.0, -2.0, x + 3.0, 3.0),
-    ]
-
-
+@settings(max_examples=12)
 @given(low=st.floats(-0.4, 0.0), x=st.floats(1.8, 2.2))
 def test_a_thin_door_keeps_its_clearance(low: float, x: float) -> None:
-    """A door of 0.8 m anywhere between the cells: where a path goes through, clearance is right within 3 cm."""
+    """A door of 0.8 m anywhere between the cells: clearance is right within 2 cm in it and 5 cm around it.
+
+    Around it the nearest point is a corner, whose mean hit lies a few centimetres along its two faces.
+    """
     high = low + 0.8
     walls = [
         *rectangle(-3.0, -3.0, x + 3.0, 3.0),
@@ -269,8 +261,8 @@ def test_a_thin_door_keeps_its_clearance(low: float, x: float) -> None:
         *rectangle(x, high, x + 0.2, 3.0),
     ]
     window = OccupancyWindow(12.0, 0.1)
-    for k in range(14):
-        robot = (x - 1.5 + 0.2 * k, 0.5 * (low + high))
+    for k in range(7):
+        robot = (x - 1.5 + 0.4 * k, 0.5 * (low + high))
         integrate(window, sweep(walls, Pose(x_m=robot[0], y_m=robot[1], z_m=SENSOR_Z_M)), *robot)
     clearance = layers_of(window).clearance_m
     middle = 0.5 * (low + high)
@@ -279,7 +271,7 @@ def test_a_thin_door_keeps_its_clearance(low: float, x: float) -> None:
         cx, cy = window.spec.centre_of(*cell)
         away = max(x - cx, 0.0, cx - x - 0.2)
         exact = min(math.hypot(away, cy - low), math.hypot(away, high - cy))
-        assert clearance[cell] == pytest.approx(exact, abs=0.03), (cx, cy)
+        assert clearance[cell] == pytest.approx(exact, abs=0.02 if away == 0.0 else 0.05), (cx, cy)
 
 
 @given(

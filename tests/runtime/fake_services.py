@@ -117,10 +117,20 @@ class Failing(_Memoryless):
         raise RuntimeError("this stage always fails")
 
 
+class Idle(_Memoryless):
+    """Gives nothing."""
+
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+        """Nothing."""
+        return []
+
+
 def make_fake(name: str, behaviour: str) -> tuple[StageSpec, Stage]:
     """The fake for a service's name."""
     if behaviour == "failing":
         return StageSpec(name, SECOND_NS // 50), Failing()
+    if behaviour == "idle":
+        return StageSpec(name, SECOND_NS), Idle()
     if behaviour == "exits":
         sys.exit(1)
     if name == "sim":

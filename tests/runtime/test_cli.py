@@ -8,15 +8,20 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from plgrim import cli
 from plgrim.cli import application
-from plgrim.config import Config
+from plgrim.config import Config, load_config
+from plgrim.missions import run_lockstep
+from plgrim.runtime import lockstep
 from plgrim.runtime.health import ask_health
 from plgrim.runtime.zenoh_session import Link
 from plgrim.warmup import warm_ups
+from schemas.contract import Stage, StageSpec
 from schemas.topics import TOPICS
+from tests.runtime.fake_services import make_fake
 from tests.runtime.helpers import FAKES, Start, eventually
 
 
@@ -32,6 +37,9 @@ def test_the_table_of_topics_names_every_topic() -> None:
         (["run", "nothing"], 2, "no service 'nothing'"),
         (["explore", "--world", "maze", "--map", "x.yaml"], 2, "exclude each other"),
         (["explore", "--config", "no/such/file.yaml"], 2, "no/such/file.yaml"),
+        (["explore", "--map", "no/such/map.yaml"], 2, "no/such/map.yaml"),
+        (["explore", "--world", "nowhere"], 2, "'nowhere' is not one of"),
+        (["explore", "--world", "maze", "--start", "1000", "1000", "--lockstep"], 2, "sim: "),
         (["healthcheck", "sim", "--timeout", "0.1"], 1, "no Zenoh router"),
         (["status", "--url", "http://127.0.0.1:9"], 1, "no status at"),
     ],
@@ -117,5 +125,33 @@ def test_the_router_refuses_a_taken_port(router: None, start: Start) -> None:
     assert "PLGRIM_ROUTER" in output
 
 
-def test_every_stage_with_kernels_says_how_to_compile_them() -> None:
-    assert all(callable(warm_up) for warm_up in warm_ups().values())
+def test_a_watcher_follows_a_mission_to_its_end_and_writes_the_result(
+    router: None, start: Start, tmp_path: Path
+) -> None:
+    watcher = start("-m", "plgrim", "watch", "--out", str(tmp_path))
+    start(str(FAKES), "sim")
+    start(str(FAKES), "mission", "ends")
+    output, _ = watcher.communicate(timeout=60)
+    assert watcher.returncode == 0, output
+    result = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
+    assert (result["finish"], result["world"], result["succeeded"]) == ("covered", "fake", True)
+    assert (tmp_path / "map.png").exists()
+
+
+def test_lock_step_writes_a_result_and_its_speed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def make(name: str, options: object, setup: object) -> tuple[StageSpec, Stage]:
+        del options, setup
+        return make_fake(name, "ends" if name in ("sim", "mission") else "idle")
+
+    monkeypatch.setattr(lockstep, "make_stage", make)
+    result = run_lockstep(load_config(), tmp_path, Console(quiet=True))
+    assert result["succeeded"] is True
+    assert (result["world"], result["finish"], result["mode"]) == ("fake", "covered", "lockstep")
+    assert result["times_real_time"] > 1
+    assert result["stages"]["sim"]["steps"] > 20
+    assert result["dropped"] == {}
+    assert result["digest"] == run_lockstep(load_config(), tmp_path, Console(quiet=True))["digest"]
+
+
+def test_stages_know_how_to_compile_their_kernels() -> None:
+    assert {"riskmap", "gcp", "sim"} <= set(warm_ups())

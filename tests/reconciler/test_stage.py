@@ -1,0 +1,344 @@
+"""The reconciler in a scripted world: what it emits when inputs stop, hazards appear, and answers come late."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from schemas.codec import Envelope, encode
+from schemas.contract import SECOND_NS, StageSetup
+from schemas.operation import MissionPhase
+from schemas.policy import Plan, SafetyState
+from schemas.topics import LOCAL_POLICY, RISK_MAP
+from services.reconciler.config import Config
+from services.reconciler.stage import create, spec
+from tests.reconciler.rig import FOOTPRINT_M, TICK_NS, Rig
+from tests.runtime.feeding import Feed
+
+FEW = Config(simulations=256)
+
+
+def driving(seconds: float = 3.0, **options: object) -> Rig:
+    """A rig whose robot is on its way."""
+    rig = Rig(**options)  # type: ignore[arg-type]
+    rig.run(seconds)
+    assert rig.plan.valid
+    assert len(rig.plan.x_m) > 30
+    return rig
+
+
+def points(plan: Plan) -> np.ndarray:
+    return np.stack([plan.x_m, plan.y_m], axis=1)
+
+
+# --- a mission that goes well -------------------------------------------------------------------------------------
+
+
+def test_plans_are_well_formed_their_ids_increase_and_none_expires() -> None:
+    rig = Rig()
+    published = []
+    for _ in range(120):
+        before = len(rig.plans)
+        rig.tick()
+        published += [(rig.now, plan) for plan in rig.plans[before:]]
+    assert math.hypot(rig.x_m, rig.y_m) > 0.5, "it drives"
+    assert len({plan.plan_id for _, plan in published}) > 5
+    for _, plan in published:
+        assert plan.valid == (len(plan.x_m) > 0)
+        assert plan.valid == (plan.safety is SafetyState.RUN and plan is not published[0][1])
+        if plan.valid:
+            assert plan.speed_mps[-1] == 0.0
+            assert np.all(np.diff(plan.time_s) > 0.0)
+    for (t0, a), (t1, b) in zip(published, published[1:], strict=False):
+        assert b.plan_id in (a.plan_id, a.plan_id + 1)
+        assert t1 - t0 <= 0.3 * SECOND_NS, "sent again long before it expires"
+        if b.plan_id == a.plan_id:
+            ahead = {p.tobytes() for p in points(a)}
+            assert all(p.tobytes() in ahead for p in points(b)), "the same plan again is the rest of the same line"
+
+
+def test_the_plan_begins_at_the_robot_and_keeps_off_walls() -> None:
+    rig = driving()
+    for _ in range(60):
+        rig.tick()
+        plan = rig.plan
+        assert math.hypot(plan.x_m[0] - rig.x_m, plan.y_m[0] - rig.y_m) < 0.45
+        assert min(rig.clearance_at(x, y) for x, y in points(plan)) > FOOTPRINT_M
+
+
+def test_what_is_kept_of_the_old_policy_stays_as_it_was_to_the_bit() -> None:
+    rig = Rig()
+    kept = 0
+    for _ in range(150):
+        before = rig.plans[-1] if rig.plans else None
+        rig.tick()
+        after = rig.plans[-1] if rig.plans else None
+        if before is None or after is None or after.plan_id == before.plan_id or not (before.valid and after.valid):
+            continue
+        old = {p.tobytes() for p in points(before)}
+        assert after.kept_points > 0, "tau covers latency and braking: the junction lies ahead of the robot"
+        for p in points(after)[: after.kept_points]:
+            assert p.tobytes() in old
+        kept += 1
+    assert kept > 5
+
+
+def test_tau_covers_planning_latency_and_braking() -> None:
+    rig = Rig()
+    for _ in range(120):
+        before, speed = len(rig.requests), rig.speed_mps
+        rig.tick()
+        if len(rig.requests) == before or len(rig.plans) < 3 or not rig.plan.valid:
+            continue
+        wanted = rig.requests[-1]
+        ahead_s = (wanted.junction_ns - wanted.stamp_ns) / SECOND_NS
+        least_m = speed * FEW.planning_latency_s + speed**2 / (2.0 * FEW.max_acceleration_mps2)
+        assert ahead_s * FEW.max_speed_mps >= least_m - 0.1
+
+
+def test_every_request_names_the_local_irm_that_it_was_made_from() -> None:
+    rig = driving(6.0)
+    for wanted in rig.requests:
+        irm = rig.irms[wanted.irm_version]
+        assert np.all(irm.state[wanted.particle_node] == 1)
+        assert math.isclose(wanted.particle_weight.sum(), 1.0)
+        assert len(wanted.covered) == irm.size
+    assert [wanted.episode for wanted in rig.requests] == list(range(1, len(rig.requests) + 1))
+    assert any(wanted.covered.any() for wanted in rig.requests[1:]), "what the kept prefix covers is told"
+
+
+def test_the_same_world_and_seed_give_the_same_bytes() -> None:
+    def run() -> list[bytes]:
+        rig = Rig()
+        rig.run(5.0)
+        return [encode(plan, Envelope("robot", "reconciler", 1, 1, 0)) for plan in rig.plans]
+
+    assert run() == run()
+
+
+def test_the_paper_profile_keeps_more() -> None:
+    taus = {}
+    for profile in ("default", "paper"):
+        rig = Rig(config=Config(simulations=256, profile=profile))  # type: ignore[arg-type]
+        rig.run(8.0)
+        taus[profile] = np.mean([(w.junction_ns - w.stamp_ns) / SECOND_NS for w in rig.requests[1:]])
+    assert taus["paper"] > 1.5 * taus["default"]
+
+
+# --- safety -------------------------------------------------------------------------------------------------------
+
+
+def test_a_frozen_risk_map_holds_within_a_period_of_its_limit() -> None:
+    rig = driving()
+    rig.send_risk, last = False, (rig.ticks // 2 * 2) * TICK_NS
+    while rig.now - last <= FEW.risk_stale_s * SECOND_NS:
+        assert rig.plan.valid
+        rig.tick()
+    assert rig.now - last <= FEW.risk_stale_s * SECOND_NS + TICK_NS
+    assert not rig.plan.valid
+    assert rig.plan.safety is SafetyState.HOLD
+    assert "risk map" in rig.plan.reason
+    assert len(rig.plan.x_m) == 0
+    held = rig.plan.plan_id
+    rig.send_risk = True
+    rig.run(0.3)
+    assert rig.plan.valid and rig.plan.plan_id > held
+
+
+def test_a_frozen_pose_holds() -> None:
+    rig = driving()
+    rig.send_odometry = False
+    rig.run(FEW.odometry_stale_s + 0.1)
+    assert not rig.plan.valid
+    assert rig.plan.safety is SafetyState.HOLD
+
+
+def test_nothing_is_emitted_before_the_first_pose_and_risk_map() -> None:
+    rig = Rig(send_risk=False)
+    rig.run(1.0)
+    assert rig.plans == [] and rig.requests == []
+
+
+@pytest.mark.parametrize(("switch", "after_s"), [("send_irm", FEW.irm_stale_s), ("answer", FEW.policy_silent_s)])
+def test_a_silent_planner_degrades_and_the_robot_slows_down(switch: str, after_s: float) -> None:
+    rig = driving(config=Config(simulations=256, max_kept_m=30.0))
+    setattr(rig, switch, False)
+    rig.run(after_s + 1.6)
+    assert rig.plan.safety is SafetyState.DEGRADED
+    limit = FEW.degraded_speed_share * FEW.max_speed_mps
+    assert rig.plan.valid and rig.plan.speed_mps.max() <= limit + 1e-9
+    setattr(rig, switch, True)
+    rig.run(2.0)
+    assert rig.plan.safety is SafetyState.RUN
+    assert rig.plan.speed_mps.max() > limit
+
+
+def test_a_pause_holds_at_once_and_no_episode_is_opened_meanwhile() -> None:
+    rig = driving()
+    rig.phase = MissionPhase.PAUSED
+    rig.tick()
+    assert not rig.plan.valid
+    assert rig.plan.safety is SafetyState.HOLD
+    assert "paused" in rig.plan.reason
+    asked, place = len(rig.requests), (rig.x_m, rig.y_m)
+    rig.run(8.0)
+    assert len(rig.requests) == asked
+    assert math.dist(place, (rig.x_m, rig.y_m)) < 1e-9
+    rig.phase = MissionPhase.EXPLORE
+    rig.run(0.2)
+    assert rig.plan.valid
+    assert rig.plan.safety is SafetyState.RUN, "the time of the pause is not lcp's silence"
+
+
+@pytest.mark.parametrize(
+    ("phase", "safety", "moves"),
+    [
+        (MissionPhase.RETURN, SafetyState.RETURN, True),
+        (MissionPhase.DONE, SafetyState.DONE, False),
+        (MissionPhase.STOPPED, SafetyState.DONE, False),
+        (MissionPhase.IDLE, SafetyState.HOLD, False),
+    ],
+)
+def test_the_mission_rules(phase: MissionPhase, safety: SafetyState, moves: bool) -> None:
+    rig = driving()
+    rig.phase = phase
+    rig.tick()
+    assert (rig.plan.safety, rig.plan.valid) == (safety, moves)
+
+
+# --- hazards ------------------------------------------------------------------------------------------------------
+
+
+def test_a_hazard_on_the_driven_path_truncates_it_in_the_first_step_that_shows_it() -> None:
+    rig = driving(4.1)
+    assert rig.ticks % 2 == 0
+    before = rig.plan
+    x, y = points(before)[25]
+    rig.wall_at(x, y)
+    rig.tick()
+    assert points(rig.plan)[-1].tobytes() == points(before)[-1].tobytes(), "no risk map has shown it yet"
+    rig.tick()
+    after = rig.plan
+    assert after.plan_id > before.plan_id
+    assert after.valid and len(after.x_m) < 30
+    assert after.speed_mps[-1] == 0.0
+    assert "hazard" in after.reason
+    assert min(rig.clearance_at(px, py) for px, py in points(after)) > FOOTPRINT_M - 0.05
+    rig.run(8.0)
+    assert rig.plan.valid and len(rig.plan.x_m) > 10, "it goes another way"
+    assert min(rig.clearance_at(px, py) for px, py in points(rig.plan)) > FOOTPRINT_M - 0.05
+
+
+def test_ground_that_is_not_known_any_more_is_a_hazard() -> None:
+    rig = driving(4.1)
+    x, y = points(rig.plan)[25]
+    row, column = rig.grid.cell_of(x, y)
+    unknown = rig.risk_map()
+    state = unknown.state.copy()
+    state[row - 2 : row + 3, column - 2 : column + 3] = 0
+    rig.send_risk = False
+    rig.tick()
+    rig.reconciler.put(RISK_MAP, unknown.model_copy(update={"state": state}), rig.now)
+    rig.tick()
+    assert len(rig.plan.x_m) < 30
+    assert "hazard" in rig.plan.reason
+
+
+def test_a_hazard_that_was_none_gives_the_path_back() -> None:
+    rig = driving(4.1)
+    clean = rig.lethal.copy()
+    end = points(rig.plan)[-1].copy()
+    rig.wall_at(*points(rig.plan)[25])
+    rig.answer = False
+    rig.run(0.2)
+    assert len(rig.plan.x_m) < 30
+    rig.lethal = clean
+    rig.run(0.2)
+    np.testing.assert_array_equal(points(rig.plan)[-1], end)
+
+
+# --- episodes -----------------------------------------------------------------------------------------------------
+
+
+def test_answers_to_old_episodes_are_dropped() -> None:
+    rig = Rig(answer_delay=round(FEW.episode_timeout_s * 10) + 5)
+    rig.run(9.0)
+    assert len(rig.delivered) >= 2, "they came"
+    assert all(policy.episode < rig.requests[-1].episode for policy in rig.delivered)
+    assert not any(plan.valid for plan in rig.plans)
+
+
+def test_an_answer_that_nobody_asked_for_changes_nothing() -> None:
+    rig = driving()
+    stale = rig.delivered[-1]
+    before = rig.plan
+    rig.moving = False
+    rig.reconciler.put(LOCAL_POLICY, stale, rig.now)
+    rig.tick()
+    assert rig.plan.plan_id == before.plan_id
+    np.testing.assert_array_equal(points(rig.plan)[-1], points(before)[-1])
+
+
+def test_one_episode_at_a_time() -> None:
+    rig = Rig(answer=False)
+    rig.run(FEW.episode_timeout_s)
+    assert len(rig.requests) == 1
+    rig.run(0.5)
+    assert len(rig.requests) == 2, "an unanswered one is given up"
+
+
+def test_off_its_path_it_plans_from_where_the_robot_is() -> None:
+    rig = driving()
+    rig.moving = False
+    line = points(rig.plan)
+    places = [(x, y) for x in np.arange(-4.0, 4.0, 0.5) for y in np.arange(-3.0, 3.0, 0.5)]
+    rig.x_m, rig.y_m = max(places, key=lambda p: float(np.hypot(line[:, 0] - p[0], line[:, 1] - p[1]).min()))
+    assert np.hypot(line[:, 0] - rig.x_m, line[:, 1] - rig.y_m).min() > FEW.off_path_m
+    rig.tick()
+    assert not rig.plan.valid
+    assert rig.plan.reason == "off the path"
+    rig.run(1.5)
+    assert rig.plan.valid
+    assert math.hypot(rig.plan.x_m[0] - rig.x_m, rig.plan.y_m[0] - rig.y_m) < 1e-6
+    assert rig.plan.kept_points == 0
+
+
+def test_blocked_for_long_it_drops_the_path() -> None:
+    rig = driving()
+    rig.moving, rig.follower_blocked = False, True
+    rig.run(FEW.blocked_s - 0.1)
+    assert rig.plan.valid
+    seen = len(rig.plans)
+    rig.run(0.6)
+    dropped = [plan for plan in rig.plans[seen:] if plan.reason == "blocked"]
+    assert dropped and not dropped[0].valid
+
+
+def test_after_a_restart_ids_go_on_increasing() -> None:
+    rig = driving()
+    rig.moving = False
+    last, asked = rig.plan.plan_id, len(rig.requests)
+    snapshot = rig.reconciler.stage.snapshot()
+    stage = create(FEW, StageSetup("robot", 3))
+    stage.restore(snapshot)
+    rig.reconciler.stage = stage
+    rig.answers.clear()
+    rig.run(2.0)
+    assert all(plan.plan_id > last for plan in rig.plans if plan is rig.plan)
+    assert rig.requests[asked].episode == asked + 1
+    assert rig.plan.valid
+    assert math.hypot(rig.plan.x_m[0] - rig.x_m, rig.plan.y_m[0] - rig.y_m) < 0.1
+
+
+def test_the_stage_runs_on_risk_maps_and_answers() -> None:
+    assert spec(FEW).period_ns == TICK_NS
+    assert set(spec(FEW).triggers) == {RISK_MAP.name, LOCAL_POLICY.name}
+    assert isinstance(Feed("reconciler", create(FEW, StageSetup("robot", 0))), Feed)
+
+
+def test_unknown_keys_are_refused_at_every_level() -> None:
+    for bad in ({"max_kept": 3}, {"weights": {"k_riks": 1.0}}):
+        with pytest.raises(ValueError, match="Extra inputs"):
+            Config.model_validate(bad)
