@@ -176,18 +176,6 @@ def _move(
 
 
 @njit
-def greedy_direction(
-    model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int
-) -> int:
-    """The informed rule: the move with the best one-step gain less cost, else towards the nearest uncovered group.
-
-    tried: bits of directions not to take. Returns -1 when nothing is left to cover.
-    """
-    best = best_gain_direction(model, state, covered, tried)
-    return best if best >= 0 else _towards_nearest(model, state[NODE], covered, tried)
-
-
-@njit
 def best_gain_direction(
     model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int
 ) -> int:
@@ -234,21 +222,13 @@ def nearest_cluster(model: CoverageModel, node: int, covered: NDArray[np.uint64]
 
 
 @njit
-def _towards_nearest(model: CoverageModel, node: int, covered: NDArray[np.uint64], tried: int) -> int:
-    nearest = nearest_cluster(model, node, covered)
-    if nearest < 0:
-        return -1
-    k = np.int64(model.cluster_move[node, nearest])
-    return -1 if (tried >> k) & 1 else k
-
-
-@njit
 def informed_move(
     model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int, group: int
 ) -> tuple[int, int]:
-    """The informed rule with a memory: the next move (-1: nothing left) and the group that it goes to (-1: none).
+    """The informed rule: the next move (-1: nothing left to cover) and the group that it goes to (-1: none).
 
-    On the way to a group it does not waver: it looks again only when the group is covered or reached.
+    The move with the best one-step gain for its cost, else towards the nearest uncovered group; tried: bits of
+    directions not to take. On the way to a group it does not waver: it looks again only when the group is covered or reached.
     """
     node = state[NODE]
     if group >= 0 and model.cluster_move[node, group] >= 0 and tried == 0 and cluster_left(model, group, covered):
@@ -292,7 +272,7 @@ def _step(
 ) -> tuple[int, float, float, bool]:
     covered = state[BITS:].view(np.uint64)
     steps = 1 if action < 8 else (MACRO_STEPS if action < SWEEP else SWEEP_STEPS)
-    total, seen, discount, blocked, group = 0.0, 0.0, 1.0, False, -1
+    total, seen, discount, blocked, group, before = 0.0, 0.0, 1.0, False, -1, state[MOVES]
     for _ in range(min(steps, model.horizon - state[MOVES])):
         k = action % 8
         if action == SWEEP:
@@ -310,7 +290,7 @@ def _step(
             break
     if state[MOVES] >= model.horizon:
         total += discount * model.leaf_value[state[NODE]]
-    elif discount == 1.0:  # nothing was left to do: the simulation would stand still for ever
+    elif state[MOVES] == before:  # nothing was left to do: the simulation would stand still for ever
         state[MOVES] = model.horizon
         total += model.leaf_value[state[NODE]]
     observation = 0
@@ -424,14 +404,15 @@ def follow_rule(
     """The moves of the informed rule from (node, heading) when nothing is blocked; covered: (size,), changed."""
     state = np.zeros(BITS + model.size, np.int64)
     state[NODE], state[HEADING] = node, heading
+    group = -1
     for i in range(moves_out.shape[0]):
-        k = greedy_direction(model, state, covered, 0)
+        k, group = informed_move(model, state, covered, 0, group)
         if k < 0:
             return i
-        if k != state[HEADING]:
-            look(model, state[NODE], k, covered)
+        information = look(model, state[NODE], k, covered) if k != state[HEADING] else 0.0
         state[NODE], state[HEADING] = model.step_to[state[NODE], k], k
-        look(model, state[NODE], k, covered)
+        information += look(model, state[NODE], k, covered)
+        group = -1 if information > 0.0 else group
         moves_out[i] = k
     return moves_out.shape[0]
 

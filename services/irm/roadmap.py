@@ -32,7 +32,7 @@ class Roadmap:
     """
 
     config: Config
-    graph: nx.Graph = field(default_factory=nx.Graph)
+    graph: nx.Graph[Any] = field(default_factory=nx.Graph)
     manager: FrontierManager = field(init=False)
     next_id: int = 1
     version: int = 0

@@ -24,7 +24,8 @@ class Window:
 
     passable: the robot's centre fits. free_space: passable and connected to the robot. ground: what its body can
     touch from there. uncovered: ground below the covered probability, slivers of one cell left out. entropy: of
-    uncovered cells, nats of whole patches (0 elsewhere). hazard: mean hazard rate under the body, 1/m. step_cost: cost per metre of the grid search.
+    uncovered cells, nats of whole patches (0 elsewhere). hazard: CVaR of the hazard rate, its mean under the body, 1/m.
+    step_cost: cost per metre of the grid search.
     """
 
     spec: GridSpec

@@ -32,7 +32,7 @@ class Config(BaseModel):
     rollout_moves: int = Field(40, ge=1, le=500, description="Moves of those rollouts.")
     # motion limits
     max_speed_mps: float = Field(1.0, gt=0, le=10, description="Speed limit, m/s.")
-    min_speed_mps: float = Field(0.25, gt=0, le=10, description="Speed in the narrowest places, m/s.")
+    min_speed_mps: float = Field(0.35, gt=0, le=10, description="Speed in the narrowest places, m/s.")
     max_acceleration_mps2: float = Field(0.8, gt=0, le=10, description="Speeding up and braking, m/s2.")
     max_turn_rate_radps: float = Field(1.2, gt=0, le=10, description="Turn rate, rad/s.")
     footprint_radius_m: float = Field(0.25, gt=0.05, le=2, description="The robot's disc, m.")

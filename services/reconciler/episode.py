@@ -40,7 +40,10 @@ class Committed:
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """An episode that waits for its answer. prefix: the line from the robot to the junction, (k, 2) m."""
+    """An episode that waits for its answer. prefix: the line from the robot to the junction, (k, 2) m.
+
+    junction_point: index of the junction in the line that was driven when the episode opened.
+    """
 
     number: int
     opened_ns: int
@@ -51,6 +54,7 @@ class Opened:
     tau_s: float
     rollout_value: float
     keeps_old: bool
+    junction_point: int = 0
 
 
 def heading_index(yaw_rad: float) -> int:

@@ -81,6 +81,7 @@ class ReconcilerStage:
         self._kept_end = 0
         self._trouble_ns = -1
         self._value_ratio = 1.0
+        self._latency_s = 0.0
         self._plan: Plan | None = None
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
@@ -202,7 +203,7 @@ class ReconcilerStage:
         c, committed = self._config, self._committed
         reachable = [i for i in usable_nodes(committed, irm, self._at) if committed.node_point[i] <= self._end]
         v = odometry.speed_mps
-        least_m = abs(v) * c.planning_latency_s + v * v / (2.0 * c.max_acceleration_mps2) + 0.2
+        least_m = abs(v) * max(c.planning_latency_s, 1.3 * self._latency_s) + v * v / (2.0 * c.max_acceleration_mps2) + 0.2
         ahead = [int(committed.node_point[i] - self._at) * STEP_M for i in reachable]
         first = next((j for j, m in enumerate(ahead) if m >= least_m), None)
         if first is None:
@@ -234,6 +235,7 @@ class ReconcilerStage:
             tau_s=ahead[kept] / max(c.max_speed_mps, 0.1),
             rollout_value=self._rollouts(model, node, self._heading(committed, reachable[kept]), covered),
             keeps_old=True,
+            junction_point=point,
         )
         return opened, self._request(now, irm, node, self._heading(committed, reachable[kept]), odometry, covered, opened)
 

@@ -7,11 +7,14 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.grid import GridSpec, overlap, window_around
+from planning.grid import overlap, window_around
 from planning.kernels import njit
 
 _BEARINGS = 900
 """Bearing bins of a sweep; the rays of all rings of one bearing are swept together."""
+
+_PIERCED_M = 0.02
+"""A ray speaks against a surface that it passes at this distance or nearer, m."""
 
 
 class OccupancyWindow:
@@ -68,7 +71,7 @@ def integrate_sweep(
     """
     height, width = log_odds.shape
     hit_now = np.zeros((height, width), dtype=np.uint8)
-    free_range = np.zeros(_BEARINGS, dtype=np.float64)
+    free_range, free_angle = np.zeros(_BEARINGS, dtype=np.float64), np.zeros(_BEARINGS, dtype=np.float64)
     cosine, sine = math.cos(sensor[3]), math.sin(sensor[3])
     bad = 0
     for i in range(points_m.shape[0]):
@@ -88,9 +91,11 @@ def integrate_sweep(
             reach = distance * room / pz if room > 0.0 else 0.0
         elif above > heights_m[1]:
             _add_hit(sensor[0] + dx, sensor[1] + dy, evidence, resolution_m, ix0, iy0, log_odds, hit_weight, hit_x, hit_y, hit_now)  # fmt: skip  # noqa: E501
-        bearing = int((math.atan2(dy, dx) / (2.0 * math.pi) + 1.0) * _BEARINGS) % _BEARINGS
-        free_range[bearing] = max(free_range[bearing], reach)
-    _clear_passed(sensor, free_range, evidence, resolution_m, ix0, iy0, log_odds, hit_weight, hit_now)
+        angle = math.atan2(dy, dx)
+        bearing = int((angle / (2.0 * math.pi) + 1.0) * _BEARINGS) % _BEARINGS
+        if reach > free_range[bearing]:
+            free_range[bearing], free_angle[bearing] = reach, angle
+    _clear_passed(sensor, free_range, free_angle, evidence, resolution_m, ix0, iy0, log_odds, hit_weight, hit_x, hit_y, hit_now)  # fmt: skip  # noqa: E501
     return bad
 
 
@@ -126,30 +131,36 @@ def _add_hit(
 def _clear_passed(
     sensor: NDArray[np.float64],
     free_range: NDArray[np.float64],
+    free_angle: NDArray[np.float64],
     evidence: NDArray[np.float64],
     resolution_m: float,
     ix0: int,
     iy0: int,
     log_odds: NDArray[np.float32],
     hit_weight: NDArray[np.float32],
+    hit_x: NDArray[np.float32],
+    hit_y: NDArray[np.float32],
     hit_now: NDArray[np.uint8],
 ) -> None:
     """Cells that rays went through are evidence of nothing there, once a sweep, unless the sweep hit them too.
 
-    Between two bearings the shorter of both counts too, so that far away no cell is missed between the rays.
+    Between two bearings the shorter of both counts too, so that far away no cell is missed between the rays. A cell
+    that was hit before is cleared only by a ray through its mean hit: a ray that grazes a wall runs through many of
+    the wall's cells in front of its surface, and would wipe the wall out behind the robot.
     """
     height, width = log_odds.shape
     passed = hit_now
     x0, y0 = sensor[0] / resolution_m - ix0, sensor[1] / resolution_m - iy0
     count = free_range.shape[0]
     for half in range(2 * count):
-        reach = free_range[half // 2]
+        reach, angle = free_range[half // 2], free_angle[half // 2]
         if half % 2 == 1:
-            reach = min(reach, free_range[(half // 2 + 1) % count])
+            after = (half // 2 + 1) % count
+            reach = min(reach, free_range[after])
+            angle += 0.5 * ((free_angle[after] - angle + math.pi) % (2.0 * math.pi) - math.pi)
         length = reach / resolution_m - 0.5
         if length <= 0.0:
             continue
-        angle = math.pi * (half + 1.0) / count
         dx, dy = math.cos(angle), math.sin(angle)
         column, row = math.floor(x0), math.floor(y0)
         step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
@@ -157,7 +168,10 @@ def _clear_passed(
         next_y = ((row + (1 if dy > 0 else 0)) - y0) / dy if dy != 0.0 else math.inf
         travelled = 0.0
         while travelled < length and 0 <= row < height and 0 <= column < width:
-            if passed[row, column] == 0:
+            off_x = column + 0.5 + hit_x[row, column] / resolution_m - x0
+            off_y = row + 0.5 + hit_y[row, column] / resolution_m - y0
+            pierced = hit_weight[row, column] == 0.0 or abs(off_x * dy - off_y * dx) * resolution_m <= _PIERCED_M
+            if passed[row, column] == 0 and pierced:
                 passed[row, column] = 2
                 log_odds[row, column] = max(log_odds[row, column] - evidence[1], -evidence[2])
                 if log_odds[row, column] < 0.0:

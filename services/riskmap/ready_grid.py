@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.riskmap.occupancy import OccupancyWindow
 from schemas.sensing import ReadyGrid
+from services.riskmap.occupancy import OccupancyWindow
 
 
 def apply_ready_grid(grid: ReadyGrid, window: OccupancyWindow, clamp_log_odds: float) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from planning.grid import GridSpec
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.sensing import PointCloud
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import CLOUD, ODOMETRY, READY_GRID, RISK_MAP
 from schemas.world import GridHeader, RiskMap
-from planning.grid import GridSpec
 from services.riskmap.collision import collision_layers
 from services.riskmap.config import Config
 from services.riskmap.occupancy import OccupancyWindow, integrate_sweep
@@ -49,10 +49,10 @@ class RiskMapStage:
         for received in inputs.new(CLOUD):
             if received.age_ns <= self._config.cloud_timeout_s * SECOND_NS:
                 self._news |= self._integrate(received.message)
-        for received in inputs.new(READY_GRID):
+        for grid in inputs.new(READY_GRID):
             self._window.roll_to(self._pose.x_m, self._pose.y_m)
-            apply_ready_grid(received.message, self._window, self._config.clamp_log_odds)
-            self._stamp_ns = max(self._stamp_ns, received.message.stamp_ns)
+            apply_ready_grid(grid.message, self._window, self._config.clamp_log_odds)
+            self._stamp_ns = max(self._stamp_ns, grid.message.stamp_ns)
             self._news = True
         due = now - self._published_ns >= self._config.publish_period_s * SECOND_NS - SECOND_NS // 100
         if not self._news or not due:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from planning.coverage import LOG_2, entropy, information_gain, look_log_odds, probability
 from planning.frames import Planar, wrap_angle
@@ -91,7 +92,7 @@ poses = st.builds(Planar, st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1
 
 @given(a=poses, b=poses, x=st.floats(-9, 9), y=st.floats(-9, 9))
 def test_poses_compose_and_invert_like_their_matrices(a: Planar, b: Planar, x: float, y: float) -> None:
-    def matrix(p: Planar) -> np.ndarray:  # type: ignore[type-arg]
+    def matrix(p: Planar) -> NDArray[np.float64]:
         c, s = math.cos(p.yaw_rad), math.sin(p.yaw_rad)
         return np.array([[c, -s, p.x_m], [s, c, p.y_m], [0, 0, 1]])
 

@@ -200,7 +200,9 @@ def test_looks_are_placed_by_the_pose_of_odom_in_map() -> None:
     scratch, again = layer_and_store()
     pose, odom = Planar(0.07, 0.03, 0.2), Planar(2.0, -1.0, math.pi / 2)
     store.add(scan_at(pose, range_m=1.5, fov_rad=1.5), ORIGIN, state, spec, odom)
-    again.add(scan_at(odom.compose(pose), range_m=1.5, fov_rad=1.5), ORIGIN, state, _shifted(spec, 10, -5), ORIGIN)
+    again.add(
+        scan_at(odom.compose(pose), range_m=1.5, fov_rad=1.5), ORIGIN, state, _shifted(spec, 10, -5), ORIGIN
+    )
     assert np.allclose(layer.read(WIDE), scratch.read(WIDE), atol=1e-5)
 
 

@@ -54,9 +54,7 @@ def random_window(seed: int) -> Window:
     free_space = ground & (rng.random(spec.shape) < 0.8)
     zeros = np.zeros(spec.shape, np.float32)
     robot = (int(rng.integers(0, 21)), int(rng.integers(0, 26)))
-    return Window(
-        spec, state, zeros, zeros, zeros + 1, free_space, ground, uncovered, zeros, entropy, robot
-    )
+    return Window(spec, state, zeros, zeros, zeros + 1, free_space, ground, uncovered, zeros, entropy, robot)
 
 
 def blocks_of(window: Window, config: Config) -> tuple[NDArray[np.int32], int, NDArray[np.int32]]:
@@ -240,7 +238,7 @@ def test_in_a_real_window_every_piece_of_uncovered_ground_has_a_frontier(seed: i
 
 def _manager(**changes: float) -> tuple[FrontierManager, Belief, Flat]:
     """A corridor of 16 x 3 m that lies in one row of blocks, so that its front is one frontier."""
-    config = Config(**changes)  # type: ignore[arg-type]
+    config = Config(**changes)
     return FrontierManager(config), Belief.new(config, 0.2), room(-8.0, 1.0, 8.0, 4.0, 0.2)
 
 

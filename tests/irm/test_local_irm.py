@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def polylines(irm: LocalIrm) -> dict[tuple[int, int], NDArray[np.float64]]:
 def _dense(line: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points every centimetre or so along a polyline, (n, 2)."""
     parts = [line[:1]]
-    for a, b in zip(line[:-1], line[1:], strict=True):
+    for a, b in pairwise(line):
         steps = max(1, math.ceil(float(np.hypot(*(b - a))) / 0.01))
         parts.append(a + (b - a) * (np.arange(1, steps + 1) / steps)[:, None])
     return np.concatenate(parts)
@@ -189,7 +190,8 @@ def _halves(window: Window) -> tuple[NDArray[np.bool_], NDArray[np.float32], tup
 
     def by_four(values: NDArray[np.float32]) -> NDArray[np.float32]:
         part = values[top : top + rows, left : left + columns]
-        return part.reshape(rows // 2, 2, columns // 2, 2).sum(axis=(1, 3))
+        sums: NDArray[np.float32] = part.reshape(rows // 2, 2, columns // 2, 2).sum(axis=(1, 3))
+        return sums
 
     closed = by_four((window.state != FREE).astype(np.float32)) >= 2
     mass = by_four(np.where(window.uncovered, window.entropy, np.float32(0)))

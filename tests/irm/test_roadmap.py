@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from itertools import pairwise
 from typing import Any
 
 import networkx as nx
@@ -40,7 +41,7 @@ def lap(step_m: float = 0.5) -> NDArray[np.float64]:
     """Places along the middle of the ring, once around, (n, 2)."""
     corners = np.array([(1.5, 1.5), (14.5, 1.5), (14.5, 10.5), (1.5, 10.5), (1.5, 1.5)])
     parts = []
-    for a, b in zip(corners[:-1], corners[1:], strict=True):
+    for a, b in pairwise(corners):
         n = math.ceil(float(np.hypot(*(b - a))) / step_m)
         parts.append(a + (b - a) * (np.arange(n) / n)[:, None])
     return np.concatenate(parts)
@@ -123,7 +124,9 @@ def test_breadcrumbs_keep_their_spacing_and_the_way_driven_is_connected() -> Non
     assert set(crumbs) == first_lap  # the second lap adds nothing
     assert 15 <= len(crumbs) <= 25
     graph = drive.roadmap.graph
-    driven = graph.edge_subgraph([(a, b) for a, b, d in graph.edges(data=True) if d["driven"] and ROBOT not in (a, b)])
+    driven = graph.edge_subgraph(
+        [(a, b) for a, b, d in graph.edges(data=True) if d["driven"] and ROBOT not in (a, b)]
+    )
     assert set(driven) == set(crumbs) and nx.is_connected(driven)
     assert drive.roadmap.breadcrumbs() == len(crumbs)
 
@@ -226,7 +229,9 @@ def test_an_edge_that_nobody_drove_also_stays_out_of_sight() -> None:
     edges = {
         (a, b)
         for a, b, d in drive.roadmap.graph.edges(data=True)
-        if not d["driven"] and ROBOT not in (a, b) and max(drive.crumbs().get(n, (99,))[0] for n in (a, b)) < 8
+        if not d["driven"]
+        and ROBOT not in (a, b)
+        and max(drive.crumbs().get(n, (99,))[0] for n in (a, b)) < 8
     }
     assert edges
     drive.stay(20.0, 0.1)
@@ -296,7 +301,8 @@ def test_a_snapshot_goes_on_alike_and_its_next_message_is_whole() -> None:
     drive.message(whole=True)
     first = twin.message()
     assert first.base_version == 0
-    for mirror, whole in zip(mirrors, (copy.deepcopy(drive.roadmap).message(Pose(), Pose(), 0, True), first), strict=True):
+    current = copy.deepcopy(drive.roadmap).message(Pose(), Pose(), 0, True)
+    for mirror, whole in zip(mirrors, (current, first), strict=True):
         assert mirror.apply(whole)
     for x, y in lap()[25:32]:
         for d in (drive, twin):

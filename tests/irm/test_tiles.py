@@ -15,9 +15,7 @@ ORIGIN = -2 * TILE - 40
 
 windows = st.tuples(
     st.integers(0, SIDE - 1), st.integers(0, SIDE - 1), st.integers(1, 300), st.integers(1, 300)
-).map(
-    lambda w: GridSpec(0.1, ORIGIN + w[0], ORIGIN + w[1], min(w[2], SIDE - w[0]), min(w[3], SIDE - w[1]))
-)
+).map(lambda w: GridSpec(0.1, ORIGIN + w[0], ORIGIN + w[1], min(w[2], SIDE - w[0]), min(w[3], SIDE - w[1])))
 
 
 def part(spec: GridSpec) -> tuple[slice, slice]:

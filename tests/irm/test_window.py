@@ -22,7 +22,8 @@ RES = 0.1
 def _reachable(passable: NDArray[np.bool_], robot: tuple[int, int]) -> NDArray[np.bool_]:
     """The 4-connected component of the robot's cell."""
     labels, _ = ndimage.label(passable)
-    return (labels == labels[robot]) & passable
+    reached: NDArray[np.bool_] = (labels == labels[robot]) & passable
+    return reached
 
 
 @settings(max_examples=25)
@@ -60,7 +61,7 @@ def test_slivers_are_what_has_no_broad_cell_beside_it(seed: int, share: float) -
     kept = without_slivers(mask)
     around = ndimage.convolve(mask.astype(int), np.ones((3, 3), int), mode="constant")
     core = mask & (around >= 6)
-    assert np.array_equal(kept, mask & ndimage.binary_dilation(core, np.ones((3, 3))))
+    assert np.array_equal(kept, mask & ndimage.binary_dilation(core, np.ones((3, 3), np.bool_)))
     assert kept[5:9, 5:9].all()
 
 
@@ -82,7 +83,9 @@ def test_what_was_passable_stays_so_while_clearance_wavers() -> None:
         belief = Belief.new(Config(clearance_margin_m=margin), RES)
         exact = risk.model_copy(update={"footprint_radius_m": float(tight) - 1e-4})
         assert belief.window(exact, -2.5, 0.0).free_space[flat.spec.cell_of(2.0, 0.0)]
-        narrower = exact.model_copy(update={"clearance_m": np.maximum(risk.clearance_m - np.float32(waver), 0)})
+        narrower = exact.model_copy(
+            update={"clearance_m": np.maximum(risk.clearance_m - np.float32(waver), 0)}
+        )
         again = belief.window(narrower, -2.5, 0.0)
         assert bool(again.free_space[flat.spec.cell_of(2.0, 0.0)]) is passes
     fresh = Belief.new(Config(), RES).window(narrower, -2.5, 0.0)

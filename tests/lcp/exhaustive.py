@@ -57,7 +57,9 @@ def _search(
         off = abs(facing[depth] - k)
         turn = min(off, 8 - off) / 4.0
         length = distance[at[depth], k]
-        total = value[depth] + discount[depth] * (k_information * gained - k_distance * length - k_turn * turn)
+        total = value[depth] + discount[depth] * (
+            k_information * gained - k_distance * length - k_turn * turn
+        )
         factor = discount[depth] * gamma**length
         best[0] = max(best[0], total)
         if total + factor * k_information * left <= best[0]:
@@ -98,7 +100,10 @@ def best_policy_value(lattice: Reference, node: int, heading: int, steps: int) -
             return seen_before.get(key, 0.0)
         best = 0.0
         for k in lattice.directions(at):
-            best = max(best, sum(p * outcome(at, facing, covered, known, left, k, b) for b, p in chances(at, k, known)))
+            best = max(
+                best,
+                sum(p * outcome(at, facing, covered, known, left, k, b) for b, p in chances(at, k, known)),
+            )
         seen_before[key] = best
         return best
 
@@ -138,7 +143,9 @@ class _World(NamedTuple):
     discount: float
 
 
-def best_open_loop_value(lattice: Reference, node: int, heading: int, risky: tuple[int, int], steps: int) -> float:
+def best_open_loop_value(
+    lattice: Reference, node: int, heading: int, risky: tuple[int, int], steps: int
+) -> float:
     """The best expected reward of up to `steps` moves that are chosen beforehand and carried out whatever happens.
 
     risky: (node, direction) of the one edge that may be blocked. A move without an edge is left out, at no cost.

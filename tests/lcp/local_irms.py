@@ -57,7 +57,7 @@ def local_irm(
         bent_edge=np.array([node * 8 + k for node, k in bent], np.int32),
         bent_start=starts.astype(np.int32),
         bent_xy=np.array([xy for p in bent.values() for xy in p], np.float32).reshape(-1, 2),
-        visible=model.visible,
+        visible=lattice.visible(),
     )
 
 

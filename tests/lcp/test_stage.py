@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -32,9 +33,7 @@ def corridor(entropy_at: dict[int, float]) -> Reference:
     entropy = np.zeros(SIZE * SIZE)
     for column, nats in entropy_at.items():
         entropy[4 * SIZE + column] = nats
-    sees = {
-        4 * SIZE + c: frozenset(4 * SIZE + o for o in entropy_at if abs(o - c) <= 2) for c in range(SIZE)
-    }
+    sees = {4 * SIZE + c: frozenset(4 * SIZE + o for o in entropy_at if abs(o - c) <= 2) for c in range(SIZE)}
     return Reference(SIZE, 2, lattice.fov_rad, lattice.weights, entropy, edges, sees)
 
 
@@ -151,7 +150,9 @@ def test_with_nothing_in_reach_it_guides_to_a_target_outside() -> None:
     assert found is not None
     assert found.phase is LocalPhase.GUIDE
     assert found.target == 7
-    assert [int(x) - IX0 for x in found.path_lattice[:, 0]] == [2, 3, 4, 5, 6, 7, 8], "as far as the lattice reaches"
+    assert [int(x) - IX0 for x in found.path_lattice[:, 0]] == [2, 3, 4, 5, 6, 7, 8], (
+        "as far as the lattice reaches"
+    )
     assert found.simulations == 0
 
 
@@ -204,7 +205,9 @@ def test_covering_begins_and_ends_at_different_thresholds() -> None:
         now = episode * SECOND_NS
         feed.put(GLOBAL_POLICY, far, now)
         feed.put(LOCAL_IRM, local_irm(lattice, episode), now)
-        phases.append(phase_of(answer(feed, request(lattice, 4 * SIZE + 2, episode=episode, version=episode), now)))
+        phases.append(
+            phase_of(answer(feed, request(lattice, 4 * SIZE + 2, episode=episode, version=episode), now))
+        )
     cover, guide = LocalPhase.COVER, LocalPhase.GUIDE
     assert phases == [cover, cover, guide, guide, cover, cover]
 
@@ -230,10 +233,10 @@ def test_on_the_way_back_nothing_is_covered() -> None:
 
 def test_the_value_of_the_leaf_draws_the_policy_to_where_the_mission_goes_on() -> None:
     """The same little ground on both sides: what is worth more afterwards decides which comes last."""
-    lattice = corridor({3: 0.4, 5: 0.4})
+    lattice = corridor({1: 0.4, 7: 0.4})
     ends = []
     for column in (0, 8):
-        feed = feed_of(lattice, FAST.model_copy(update={"path_steps": 6}))
+        feed = feed_of(lattice)
         policy = global_policy([at(4), at(column)], values=[(*at(column), 6.0)])
         feed.put(GLOBAL_POLICY, policy, 0)
         found = answer(feed, request(lattice, 4 * SIZE + 4, heading=2, simulations=1024))
@@ -253,7 +256,7 @@ def test_the_path_goes_over_edges_and_its_line_through_the_anchors(seed: int) ->
     assert found is not None and found.phase is LocalPhase.COVER
     nodes = [(int(y) - IY0) * SIZE + int(x) - IX0 for x, y in found.path_lattice]
     assert nodes[0] == node
-    for a, b in zip(nodes, nodes[1:], strict=False):
+    for a, b in itertools.pairwise(nodes):
         step = (b % SIZE - a % SIZE, b // SIZE - a // SIZE)
         assert (a, STEPS.index(step)) in lattice.edges
     assert len(found.path_node_point) == len(nodes)
@@ -274,9 +277,13 @@ def test_a_bent_edge_is_driven_along_its_inner_points_in_both_directions(backwar
     feed.put(GLOBAL_POLICY, global_policy([at(first), at(last)]), 0)
     found = answer(feed, request(lattice, 4 * SIZE + first))
     assert found is not None
-    line = [anchor_of(lattice, 4 * SIZE + c) for c in (2, 3)] + inner + [anchor_of(lattice, 4 * SIZE + c) for c in (4, 5)]
+    line = (
+        [anchor_of(lattice, 4 * SIZE + c) for c in (2, 3)]
+        + inner
+        + [anchor_of(lattice, 4 * SIZE + c) for c in (4, 5)]
+    )
     np.testing.assert_allclose(found.path_xy_m, line[::-1] if backwards else line, atol=1e-5)
-    assert found.path_node_point.tolist() == ([0, 1, 4, 5] if backwards else [0, 1, 4, 5])
+    assert found.path_node_point.tolist() == [0, 1, 4, 5]
 
 
 def test_the_policy_tree_is_a_tree() -> None:
@@ -284,7 +291,9 @@ def test_the_policy_tree_is_a_tree() -> None:
     found = answer(feed_of(lattice), request(lattice, 40, simulations=1024))
     assert found is not None
     m = len(found.tree_action)
-    assert sorted(found.child_node.tolist()) == list(range(1, m)), "every node but the root is one node's child"
+    assert sorted(found.child_node.tolist()) == list(range(1, m)), (
+        "every node but the root is one node's child"
+    )
     assert found.child_start[0] == 0 and found.child_start[-1] == len(found.child_node)
     assert np.all(np.diff(found.child_start) >= 0)
     assert np.all(found.tree_action[0] >= 0)
@@ -337,7 +346,9 @@ def test_it_goes_on_from_a_snapshot() -> None:
     second.put(GLOBAL_POLICY, global_policy([at(2), at(30)]), 0)
     assert answer(second, request(middle, 4 * SIZE + 2, episode=4)) is None, "that episode was answered"
     again = answer(second, request(middle, 4 * SIZE + 2, episode=5), 2 * SECOND_NS)
-    assert phase_of(again) is LocalPhase.GUIDE, "it had stopped covering, and this is too little to begin again"
+    assert phase_of(again) is LocalPhase.GUIDE, (
+        "it had stopped covering, and this is too little to begin again"
+    )
 
 
 def test_a_deadline_ends_the_search_and_says_how_far_it_came() -> None:

@@ -120,15 +120,10 @@ class Reference:
         rollout_random: float = 0.0,
     ) -> CoverageModel:
         """The compiled model of this problem."""
-        n, rows = self.size**2, 2 * self.reach + 1
+        n = self.size**2
         distance, risk = np.zeros((n, 8), np.float32), np.zeros((n, 8), np.float32)
         for (a, k), edge in self.edges.items():
             distance[a, k], risk[a, k] = edge
-        visible = np.zeros((n, rows), np.uint32)
-        for a, seen in self.sees.items():
-            for other in seen:
-                row = other // self.size - a // self.size + self.reach
-                visible[a, row] |= np.uint32(1 << (other % self.size - a % self.size + self.reach))
         return build_model(
             size=self.size,
             reach=self.reach,
@@ -136,7 +131,7 @@ class Reference:
             edge_distance_m=distance,
             edge_risk=risk,
             entropy=self.entropy,
-            visible=visible,
+            visible=self.visible(),
             leaf_value=self.leaf_value if len(self.leaf_value) else np.zeros(n),
             root=RootBelief(
                 np.array([node], np.int32), np.array([heading], np.uint8), np.ones(1), self.bits(covered)
@@ -145,6 +140,15 @@ class Reference:
             horizon=horizon,
             rollout_random=rollout_random,
         )
+
+    def visible(self) -> NDArray[np.uint32]:
+        """What each node sees as rows of bits around it, (n, 2 reach + 1)."""
+        rows = np.zeros((self.size**2, 2 * self.reach + 1), np.uint32)
+        for a, seen in self.sees.items():
+            for other in seen:
+                row = other // self.size - a // self.size + self.reach
+                rows[a, row] |= np.uint32(1 << (other % self.size - a % self.size + self.reach))
+        return rows
 
     def bits(self, nodes: Iterable[int]) -> NDArray[np.uint64]:
         """A set of nodes as coverage words."""
@@ -175,9 +179,9 @@ def random_lattice(
     covered_share: float = 0.0,
     weights: RewardWeights | None = None,
 ) -> Reference:
-    """A lattice of random entropies. wall_share: nodes that are not there. risky_share: edges with rho from 0.05 to 0.85.
+    """A lattice of random entropies.
 
-    hidden_share: nodes in range that are not in sight after all. covered_share: nodes of entropy 0.
+    wall_share: nodes that are not there. risky_share: edges with rho from 0.05 to 0.85. hidden_share: nodes in range that are not in sight after all. covered_share: nodes of entropy 0.
     """
     rng = np.random.default_rng(seed)
     n = size * size

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -17,6 +18,7 @@ from planning.coverage_model import (
     KEY,
     MACRO_STEPS,
     MAX_EDGE_RISK,
+    MOVES,
     NODE,
     SWEEP,
     SWEEP_STEPS,
@@ -49,9 +51,13 @@ def start_of(lattice: Reference, rng: np.random.Generator) -> int:
     return int(rng.choice(sorted({node for node, _ in lattice.edges})))
 
 
-def state_at(lattice: Reference, node: int, heading: int, key: int, covered: frozenset[int]) -> NDArray[np.int64]:
-    words = lattice.bits(covered).view(np.int64)
-    return np.concatenate([np.array([node, heading, key], np.int64), words])
+def state_at(
+    lattice: Reference, node: int, heading: int, key: int, covered: frozenset[int], moves: int = 0
+) -> NDArray[np.int64]:
+    state = np.zeros(BITS + lattice.size, np.int64)
+    state[NODE], state[HEADING], state[KEY], state[MOVES] = node, heading, key, moves
+    state[BITS:] = lattice.bits(covered).view(np.int64)
+    return state
 
 
 # --- what is seen -------------------------------------------------------------------------------------------------
@@ -68,7 +74,8 @@ def test_a_look_covers_the_footprint_and_pays_its_entropies(
     covered = lattice.bits(before)
     node, heading = int(rng.integers(size * size)), int(rng.integers(8))
     fresh = lattice.footprint(node, heading) - before
-    assert new_nodes(model, node, heading, covered) == len(fresh)
+    sees = (model.footprint, model.row_low, model.row_high, model.top[node])
+    assert new_nodes(*sees, node, heading, covered) == len(fresh)
     information = look(model, node, heading, covered)
     assert math.isclose(information, lattice.information(fresh), rel_tol=1e-12, abs_tol=1e-12)
     assert lattice.nodes(covered) == before | fresh
@@ -99,7 +106,7 @@ def test_only_what_a_connected_node_sees_has_entropy(seed: int) -> None:
     connected = {node for node, _ in lattice.edges}
     seen = set().union(*(lattice.sees[node] for node in connected)) if connected else set()
     entropy = np.random.default_rng(seed).uniform(0.1, 1.0, 36).astype(np.float32)
-    found = reachable_entropy(entropy, model.visible, model.edge_distance_m, 6, 2)
+    found = reachable_entropy(entropy, lattice.visible(), model.edge_distance_m, 6, 2)
     np.testing.assert_array_equal(found, [entropy[i] if i in seen else 0.0 for i in range(36)])
 
 
@@ -148,62 +155,78 @@ def test_an_edge_without_risk_is_never_blocked() -> None:
 
 
 def reference_action(
-    lattice: Reference, state: NDArray[np.int64], directions: list[int]
-) -> tuple[NDArray[np.int64], float, float, float, bool]:
-    """Moves until one is impossible or blocked. Returns (state, reward, discount, information, blocked)."""
+    lattice: Reference, state: NDArray[np.int64], directions: list[int], horizon: int
+) -> tuple[NDArray[np.int64], float, float, float, bool, bool]:
+    """Moves until one is impossible or blocked, or the horizon is reached, where the value of the leaf is paid.
+
+    Returns (state, reward, discount, information, blocked, terminal). Standing still would go on for ever: it is the
+    end of the simulation too.
+    """
     model = lattice.model()
-    node, heading, key = (int(v) for v in state[:BITS])
+    node, heading, key, moves = (int(state[i]) for i in (NODE, HEADING, KEY, MOVES))
     covered = lattice.nodes(state[BITS:].view(np.uint64))
-    value, discount, blocked, before = 0.0, 1.0, False, covered
+    value, discount, blocked, before, first = 0.0, 1.0, False, covered, moves
     for k in directions:
         edge = lattice.edges.get((node, k))
-        if edge is None or edge.risk > MAX_EDGE_RISK or blocked:
+        if edge is None or edge.risk > MAX_EDGE_RISK or blocked or moves == horizon:
             break
         blocked = edge_blocked(model, key, node, k)
         node, covered, gained, factor = lattice.move(node, heading, covered, k, blocked)
-        heading = k
+        heading, moves = k, moves + 1
         value += discount * gained
         discount *= factor
     information = lattice.information(covered - before)
-    return state_at(lattice, node, heading, key, covered), value, discount, information, blocked
+    terminal = moves in (first, horizon)
+    if terminal:
+        value, moves = value + discount * float(lattice.leaf_value[node]), horizon
+    after = state_at(lattice, node, heading, key, covered, moves)
+    return after, value, discount, information, blocked, terminal
 
 
-@settings(max_examples=120)
-@given(SEEDS, st.integers(0, 15))
-def test_a_step_pays_the_formula_and_discounts_by_travel(seed: int, action: int) -> None:
-    rng = np.random.default_rng(seed)
-    lattice = random_lattice(
-        seed, 6, 2, wall_share=0.1, risky_share=0.5, hidden_share=0.2, weights=WEIGHTS
-    )
-    covered = frozenset(int(i) for i in np.flatnonzero(rng.random(36) < 0.2))
-    state = state_at(
-        lattice, start_of(lattice, rng), int(rng.integers(8)), int(rng.integers(2**62)), covered
-    )
-    directions = [action % 8] * (1 if action < 8 else MACRO_STEPS)
-    expected, value, factor, information, blocked = reference_action(lattice, state, directions)
-    observation, reward, discount, terminal = _step(lattice.model(), state, action, random_stream(0))
-    np.testing.assert_array_equal(state, expected)
+def check_step(
+    lattice: Reference, state: NDArray[np.int64], action: int, directions: list[int], horizon: int
+) -> None:
+    """One step of the model against the reference."""
+    model = lattice.model(int(state[NODE]), int(state[HEADING]), horizon=horizon)
+    after, value, factor, information, blocked, ends = reference_action(lattice, state, directions, horizon)
+    observation, reward, discount, terminal = _step(model, state, action, random_stream(0))
+    np.testing.assert_array_equal(state, after)
     assert math.isclose(reward, value, rel_tol=1e-6, abs_tol=1e-9)
     assert math.isclose(discount, factor, rel_tol=1e-6)
-    assert not terminal
+    assert terminal == ends
     assert (observation >= 8) == blocked
     assert observation % 8 == sum(information > bound for bound in (0.02, 0.5, 1.5, 3.0))
+
+
+@settings(max_examples=150)
+@given(SEEDS, st.integers(0, 15), st.integers(0, 5), st.sampled_from([0.93, 1.0]))
+def test_a_step_pays_the_formula_and_discounts_by_travel(
+    seed: int, action: int, moves_left: int, gamma: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(
+        seed, 6, 2, wall_share=0.1, risky_share=0.5, hidden_share=0.2,
+        weights=WEIGHTS.model_copy(update={"gamma_per_m": gamma}),
+    )  # fmt: skip
+    lattice = replace(lattice, leaf_value=rng.uniform(0.0, 5.0, 36))
+    covered = frozenset(int(i) for i in np.flatnonzero(rng.random(36) < 0.2))
+    start, heading, key = start_of(lattice, rng), int(rng.integers(8)), int(rng.integers(2**62))
+    state = state_at(lattice, start, heading, key, covered, 9 - moves_left)
+    directions = [action % 8] * (1 if action < 8 else MACRO_STEPS)
+    check_step(lattice, state, action, directions, 9)
 
 
 @given(SEEDS)
 def test_a_sweep_is_the_informed_rule(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    lattice = random_lattice(seed, 6, 2, wall_share=0.1, weights=WEIGHTS)
+    lattice = random_lattice(seed, 6, 2, wall_share=0.1, covered_share=0.6, weights=WEIGHTS)
+    lattice = replace(lattice, leaf_value=rng.uniform(0.0, 5.0, 36))
     node, heading = start_of(lattice, rng), int(rng.integers(8))
     model = lattice.model(node, heading)
-    state = state_at(lattice, node, heading, 7, frozenset())
     moves = np.zeros(SWEEP_STEPS, np.int64)
     count = follow_rule(model, node, heading, model.covered.copy(), moves)
-    expected, value, factor, _, _ = reference_action(lattice, state, [int(k) for k in moves[:count]])
-    _, reward, discount, _ = _step(model, state, SWEEP, random_stream(0))
-    np.testing.assert_array_equal(state, expected)
-    assert math.isclose(reward, value, rel_tol=1e-6, abs_tol=1e-9)
-    assert math.isclose(discount, factor, rel_tol=1e-6)
+    state = state_at(lattice, node, heading, 7, frozenset())
+    check_step(lattice, state, SWEEP, [int(k) for k in moves[:count]], 40)
 
 
 def test_mu_is_the_turn_as_a_share_of_half_a_turn() -> None:
@@ -386,8 +409,7 @@ def test_a_viewpoint_sees_most_of_its_block() -> None:
     block = {r * 7 + c for r in range(3, 6) for c in range(3, 6)}
     words = lattice.bits(block)[3:6].copy()
     cost = np.zeros(49)
-    model = lattice.model()
-    best = best_viewpoint(model.visible, cost, 7, 2, 3, words, 4.0, 4.0)
+    best = best_viewpoint(lattice.visible(), cost, 7, 2, 3, words, 4.0, 4.0)
     scores = {
         node: len(lattice.sees[node] & block) - 0.3 * math.hypot(node // 7 - 4, node % 7 - 4)
         for node in range(49)
@@ -399,27 +421,24 @@ def test_a_viewpoint_sees_most_of_its_block() -> None:
 # --- rollouts -----------------------------------------------------------------------------------------------------
 
 
-@given(SEEDS)
-def test_a_rollout_without_chance_is_the_rule_and_the_leaf(seed: int) -> None:
+@given(SEEDS, st.integers(1, 30))
+def test_a_rollout_without_chance_is_the_rule_and_the_leaf(seed: int, horizon: int) -> None:
     rng = np.random.default_rng(seed)
-    lattice = random_lattice(seed, 6, 2, wall_share=0.1, weights=WEIGHTS)
+    lattice = random_lattice(seed, 6, 2, wall_share=0.1, covered_share=0.5, weights=WEIGHTS)
     leaf = rng.uniform(0.0, 5.0, 36)
     node, heading = start_of(lattice, rng), int(rng.integers(8))
-    model = lattice.model(node, heading, rollout_steps=5)._replace(leaf_value=leaf)
-    moves = np.zeros(5, np.int64)
+    model = replace(lattice, leaf_value=leaf).model(node, heading, horizon=horizon)
+    moves = np.zeros(horizon, np.int64)
     count = follow_rule(model, node, heading, model.covered.copy(), moves)
     value, discount, at, facing, seen = 0.0, 1.0, node, heading, frozenset[int]()
-    for k in moves[:count]:
-        before = seen
-        at, seen, gained, factor = lattice.move(at, facing, seen, int(k), False)
-        value, discount, facing = value + discount * gained, discount * factor, int(k)
-        assume(seen != before)  # on the way to something far off a rollout does not waver, the rule may
+    for k in moves[:count].tolist():
+        at, seen, gained, factor = lattice.move(at, facing, seen, k, False)
+        value, discount, facing = value + discount * gained, discount * factor, k
     value += discount * leaf[at]
-    assert math.isclose(
-        rollout_value(model, node, heading, model.covered, random_stream(1), 3), value, rel_tol=1e-6, abs_tol=1e-9
-    )
-    state = state_at(lattice, node, heading, 5, frozenset())
-    assert _rollout(model, state, 0, random_stream(1)) == leaf[node]
+    found = rollout_value(model, node, heading, model.covered, random_stream(1), 3)
+    assert math.isclose(found, value, rel_tol=1e-6, abs_tol=1e-9)
+    at_the_horizon = state_at(lattice, node, heading, 5, frozenset(), horizon)
+    assert _rollout(model, at_the_horizon, 3, random_stream(1)) == leaf[node]
 
 
 def test_rollouts_with_chance_stay_on_edges() -> None:
@@ -428,7 +447,7 @@ def test_rollouts_with_chance_stay_on_edges() -> None:
     rng = random_stream(8)
     nodes = {node for node, _ in lattice.edges}
     start = min(nodes)
-    model = lattice.model(start, rollout_steps=30, rollout_random=0.7)
+    model = lattice.model(start, horizon=30, rollout_random=0.7)
     within, ends = reachable(lattice, start), set()
     for key in range(300):
         state = state_at(lattice, start, 0, key, frozenset())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import networkx as nx
@@ -37,14 +38,16 @@ def test_travel_costs_are_those_of_dijkstra_and_the_moves_lead_there(
 ) -> None:
     lattice = random_lattice(seed, 6, 1, wall_share=0.3, risky_share=0.5)
     distance, risk = columns(lattice)
-    graph = nx.Graph()
+    graph: nx.Graph[int] = nx.Graph()
     graph.add_nodes_from(range(36))
     for (node, k), edge in lattice.edges.items():
         if edge.risk <= np.float32(max_risk):
-            graph.add_edge(node, lattice.neighbour(node, k), weight=edge.distance_m + risk_weight_m * edge.risk)
+            graph.add_edge(
+                node, lattice.neighbour(node, k), weight=edge.distance_m + risk_weight_m * edge.risk
+            )
     source = seed % 36
     cost, move = np.empty(36), np.empty(36, np.int8)
-    travel_costs(source, 6, distance, risk, risk_weight_m, np.float32(max_risk), cost, move)
+    travel_costs(source, 6, distance, risk, risk_weight_m, float(np.float32(max_risk)), cost, move)
     expected = nx.single_source_dijkstra_path_length(graph, source)
     for node in range(36):
         assert math.isclose(cost[node], expected.get(node, math.inf), rel_tol=1e-6, abs_tol=1e-9)
@@ -90,12 +93,14 @@ def test_values_find_their_way_through_a_long_spiral() -> None:
     """The sweeps must not stop before a value has come to the far end of a way as long as the lattice is big."""
     size = 9
     way = [(x, 0) for x in range(9)]
-    way += [(8, y) for y in range(1, 9)] + [(x, 8) for x in range(7, -1, -1)] + [(0, y) for y in range(7, 1, -1)]
+    way += (
+        [(8, y) for y in range(1, 9)] + [(x, 8) for x in range(7, -1, -1)] + [(0, y) for y in range(7, 1, -1)]
+    )
     way += [(x, 2) for x in range(1, 7)] + [(6, y) for y in range(3, 7)] + [(x, 6) for x in range(5, 1, -1)]
     way += [(2, 5), (2, 4), (3, 4), (4, 4)]
     distance, risk = np.zeros((81, 8), np.float32), np.zeros((81, 8), np.float32)
     nodes = [y * size + x for x, y in way]
-    for a, b in zip(nodes, nodes[1:], strict=False):
+    for a, b in itertools.pairwise(nodes):
         k = next(k for k in range(8) if neighbour(a, k, size) == b)
         distance[a, k] = distance[b, (k + 4) % 8] = 1.0
     for ends in ((nodes[0], nodes[-1]), (nodes[-1], nodes[0])):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from planning.footprint import clearance_m
 from planning.grid import FREE, LETHAL, GridSpec
 from schemas.base import Pose
-from schemas.contract import SECOND_NS, Outputs, StageSetup
+from schemas.contract import SECOND_NS, Outputs, StageSetup, Topic
 from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, LocalPolicy, Plan
 from schemas.sensing import FollowerState, Odometry
@@ -25,7 +25,7 @@ from services.lcp import stage as lcp_stage
 from services.reconciler import stage as reconciler_stage
 from services.reconciler.config import Config
 from tests.lcp.local_irms import mission
-from tests.runtime.feeding import Feed, only
+from tests.runtime.feeding import Feed, M, only
 
 TICK_NS = SECOND_NS // 10
 RESOLUTION_M = 0.2
@@ -60,9 +60,7 @@ class Rig:
     def __post_init__(self) -> None:
         setup = StageSetup("robot", self.seed)
         self.reconciler = Feed("reconciler", reconciler_stage.create(self.config, setup))
-        self.irm = Feed(
-            "irm", irm_stage.create(irm_stage.Config(size=IRM_SIZE, sensor_range_m=3.0), setup)
-        )
+        self.irm = Feed("irm", irm_stage.create(irm_stage.Config(size=IRM_SIZE, sensor_range_m=3.0), setup))
         self.lcp = Feed("lcp", lcp_stage.create(LCP, setup))
         self.ticks = -1
         self.x_m = self.y_m = self.yaw_rad = self.speed_mps = 0.0
@@ -80,8 +78,7 @@ class Rig:
         """The clock, ns."""
         return self.ticks * TICK_NS
 
-    @property
-    def plan(self) -> Plan:
+    def last(self) -> Plan:
         """The plan that was published last."""
         return self.plans[-1]
 
@@ -108,7 +105,7 @@ class Rig:
         self._deliver()
         return self._collect(self.reconciler.step(self.now))
 
-    def _both(self, topic, message) -> None:  # type: ignore[no-untyped-def]
+    def _both(self, topic: Topic[M], message: M) -> None:
         self.reconciler.put(topic, message, self.now)
         self.irm.put(topic, message, self.now)
 
@@ -142,15 +139,15 @@ class Rig:
 
     def _drive(self) -> None:
         """Along the plan, at its speed, as far as a tenth of a second goes."""
-        if not self.plans or not self.plan.valid or len(self.plan.x_m) < 2:
+        if not self.plans or not self.last().valid or len(self.last().x_m) < 2:
             self.speed_mps = 0.0
             return
-        line = np.stack([self.plan.x_m, self.plan.y_m], axis=1)[:40]
+        line = np.stack([self.last().x_m, self.last().y_m], axis=1)[:40]
         at = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
         fine = np.arange(0.0, at[-1], 0.01)
         off = np.hypot(np.interp(fine, at, line[:, 0]) - self.x_m, np.interp(fine, at, line[:, 1]) - self.y_m)
         along = float(fine[int(np.argmin(off))]) if len(fine) else 0.0
-        self.speed_mps = float(np.interp(along, at, self.plan.speed_mps[:40]))
+        self.speed_mps = float(np.interp(along, at, self.last().speed_mps[:40]))
         ahead = min(along + 0.1 * self.speed_mps, at[-1])
         x, y = float(np.interp(ahead, at, line[:, 0])), float(np.interp(ahead, at, line[:, 1]))
         if math.hypot(x - self.x_m, y - self.y_m) > 1e-3:
@@ -160,7 +157,7 @@ class Rig:
     def _follower(self) -> FollowerState:
         return FollowerState(
             stamp_ns=self.now,
-            plan_id=self.plan.plan_id,
+            plan_id=self.last().plan_id,
             progress_m=0.0,
             tracking_error_m=0.0,
             stuck=False,
@@ -185,7 +182,9 @@ class Rig:
         zero = np.zeros(s.shape, np.float32)
         return RiskMap(
             stamp_ns=self.now,
-            grid=GridHeader(resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, width=s.width, height=s.height),
+            grid=GridHeader(
+                resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, width=s.width, height=s.height
+            ),
             robot_pose=Pose(x_m=self.x_m, y_m=self.y_m, yaw_rad=self.yaw_rad),
             footprint_radius_m=FOOTPRINT_M,
             state=np.where(self.lethal, LETHAL, FREE).astype(np.uint8),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -46,7 +47,7 @@ def committed_along(lattice: Reference, nodes: list[int], between: int = 3) -> C
     """A path through the anchors of these nodes with some points in between."""
     line: list[tuple[float, float]] = []
     node_point = []
-    for a, b in zip(nodes, nodes[1:], strict=False):
+    for a, b in itertools.pairwise(nodes):
         (x0, y0), (x1, y1) = anchor_of(lattice, a), anchor_of(lattice, b)
         node_point.append(len(line))
         line += [(x0 + (x1 - x0) * i / between, y0 + (y1 - y0) * i / between) for i in range(between)]
@@ -128,22 +129,25 @@ def test_the_junction_belief(seed: int, deviation: float, count: int) -> None:
     rng = np.random.default_rng(seed)
     lattice = random_lattice(seed, SIZE, 1, wall_share=0.3)
     node = int(rng.choice(sorted({node for node, _ in lattice.edges})))
-    arguments = (local_irm(lattice), node, 3, odometry(0.0, 0.0, deviation=deviation), count, 5, 9)
-    nodes, headings_, weights = junction_particles(*arguments)
+    irm, pose = local_irm(lattice), odometry(0.0, 0.0, deviation=deviation)
+    nodes, headings_, weights = junction_particles(irm, node, 3, pose, count, 5, 9)
     assert math.isclose(weights.sum(), 1.0) and weights.min() > 0.0
     states = list(zip(nodes.tolist(), headings_.tolist(), strict=True))
     assert len(set(states)) == len(states)
     assert (node, 3) in states
     assert {n for n, _ in states} <= {n for n, _ in lattice.edges}, "only where the robot can be"
     assert np.all(np.diff(weights) <= 1e-12), "the most likely first"
-    again = junction_particles(*arguments)
-    assert all(np.array_equal(a, b) for a, b in zip((nodes, headings_, weights), again, strict=True))
+    again = junction_particles(irm, node, 3, pose, count, 5, 9)
+    np.testing.assert_array_equal(again[0], nodes)
+    np.testing.assert_array_equal(again[1], headings_)
+    np.testing.assert_array_equal(again[2], weights)
 
 
 def test_the_junction_belief_spreads_with_the_covariance() -> None:
     irm = local_irm(random_lattice(2, SIZE, 1))
     sizes = [
-        len(junction_particles(irm, 24, 0, odometry(0.0, 0.0, deviation=d), 300, 1, 1)[0]) for d in (0.0, 0.3, 1.0)
+        len(junction_particles(irm, 24, 0, odometry(0.0, 0.0, deviation=d), 300, 1, 1)[0])
+        for d in (0.0, 0.3, 1.0)
     ]
     assert sizes[0] < sizes[1] < sizes[2]
 
@@ -192,7 +196,9 @@ def test_nodes_to_avoid_and_nodes_without_edges_are_no_way_back() -> None:
     assert second is not None and second[0] != first[0]
     cut = irm.edge_distance_m.copy()
     cut[first[0]] = 0.0
-    third = line_to_lattice(irm.model_copy(update={"edge_distance_m": cut}), ground(lethal), odometry(x, y), 0.2, set())
+    third = line_to_lattice(
+        irm.model_copy(update={"edge_distance_m": cut}), ground(lethal), odometry(x, y), 0.2, set()
+    )
     assert third is not None and third[0] != first[0]
 
 
@@ -203,7 +209,10 @@ def test_walled_in_there_is_no_way() -> None:
     blocked = irm.state.copy()
     blocked[3 * SIZE + 3] = 2
     x, y = IX0 + 3.5, IY0 + 3.5
-    assert line_to_lattice(irm.model_copy(update={"state": blocked}), ground(lethal), odometry(x, y), 0.2, set()) is None
+    assert (
+        line_to_lattice(irm.model_copy(update={"state": blocked}), ground(lethal), odometry(x, y), 0.2, set())
+        is None
+    )
     outside = odometry(IX0 + 50.0, IY0)
     assert line_to_lattice(irm, ground(lethal), outside, 0.2, set()) is None
 

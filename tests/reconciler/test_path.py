@@ -68,7 +68,9 @@ def grid_path(ground: Ground, seed: int) -> Line | None:
     if not np.isfinite(cost[end[0], end[1]]) or cost[end[0], end[1]] < 2.0:
         return None
     found = trace_path(parent, int(end[0]), int(end[1]))
-    return np.array([s.centre_of(int(r), int(c)) for r, c in found[::4]] + [s.centre_of(int(end[0]), int(end[1]))])
+    return np.array(
+        [s.centre_of(int(r), int(c)) for r, c in found[::4]] + [s.centre_of(int(end[0]), int(end[1]))]
+    )
 
 
 # --- smoothing ----------------------------------------------------------------------------------------------------
@@ -142,7 +144,8 @@ def test_projection_is_the_nearest_point_of_the_window(seed: int) -> None:
     high = int(rng.integers(low, 20))
     index, distance = project(line, x, y, low, high)
     expected = min((math.dist(line[i], (x, y)), i) for i in range(low, high + 1))
-    assert (index, distance) == (expected[1], pytest.approx(expected[0]))
+    assert index == expected[1]
+    assert distance == pytest.approx(expected[0])
 
 
 @settings(max_examples=40)
@@ -181,7 +184,9 @@ def wavy(seed: int) -> Line:
     """A line of bends, none of them sharper than the slowest speed allows to turn."""
     rng = np.random.default_rng(seed)
     yaw = np.cumsum(rng.uniform(-0.25, 0.25, 60))
-    return np.cumsum(np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * STEP_M, axis=0) + np.array([-2.0, 0.0])
+    line: Line = np.cumsum(np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * STEP_M, axis=0)
+    line[:, 0] -= 2.0
+    return line
 
 
 @given(SEEDS, st.floats(0.0, 1.0), st.sampled_from([1.0, 0.5]))

@@ -31,9 +31,10 @@ def ages(limit_s: float) -> tuple[tuple[float | None, bool], ...]:
 
 def test_every_combination() -> None:
     silences = ((0.0, False), (6.0, False), (6.1, True))
-    for (risk, risk_old), (odometry, odometry_old), (irm, irm_old), (silence, silent), phase in itertools.product(
-        ages(1.5), ages(0.5), ages(3.0), silences, ASKED_BY_PHASE
-    ):
+    for (risk, risk_old), (odometry, odometry_old), (irm, irm_old), (
+        silence,
+        silent,
+    ), phase in itertools.product(ages(1.5), ages(0.5), ages(3.0), silences, ASKED_BY_PHASE):
         verdict = judge(LIMITS, SafetyInputs(risk, odometry, irm, silence, phase))
         asked = {ASKED_BY_PHASE[phase]}
         asked |= {HOLD} if risk_old or odometry_old else set()
@@ -52,12 +53,17 @@ def good(phase: MissionPhase = MissionPhase.EXPLORE) -> SafetyInputs:
 
 @pytest.mark.parametrize(
     ("name", "limit_s", "over"),
-    [("risk_age_s", 1.5, HOLD), ("odometry_age_s", 0.5, HOLD), ("irm_age_s", 3.0, DEGRADED), ("policy_silence_s", 6.0, DEGRADED)],
+    [
+        ("risk_age_s", 1.5, HOLD),
+        ("odometry_age_s", 0.5, HOLD),
+        ("irm_age_s", 3.0, DEGRADED),
+        ("policy_silence_s", 6.0, DEGRADED),
+    ],
 )
 def test_stepping_time_over_each_limit_and_back(name: str, limit_s: float, over: SafetyState) -> None:
-    for tenth in range(0, 200):
+    for tenth in range(200):
         age = tenth / 10
-        verdict = judge(LIMITS, good()._replace(**{name: age}))
+        verdict = judge(LIMITS, SafetyInputs(**{**good()._asdict(), name: age}))
         assert verdict.state is (over if age > limit_s else RUN), age
     assert judge(LIMITS, good()) == Verdict(RUN, "", True, False), "it has no memory: what is well again runs"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -24,8 +25,8 @@ def driving(seconds: float = 3.0, **options: object) -> Rig:
     """A rig whose robot is on its way."""
     rig = Rig(**options)  # type: ignore[arg-type]
     rig.run(seconds)
-    assert rig.plan.valid
-    assert len(rig.plan.x_m) > 30
+    assert rig.last().valid
+    assert len(rig.last().x_m) > 30
     return rig
 
 
@@ -51,19 +52,21 @@ def test_plans_are_well_formed_their_ids_increase_and_none_expires() -> None:
         if plan.valid:
             assert plan.speed_mps[-1] == 0.0
             assert np.all(np.diff(plan.time_s) > 0.0)
-    for (t0, a), (t1, b) in zip(published, published[1:], strict=False):
+    for (t0, a), (t1, b) in itertools.pairwise(published):
         assert b.plan_id in (a.plan_id, a.plan_id + 1)
         assert t1 - t0 <= 0.3 * SECOND_NS, "sent again long before it expires"
         if b.plan_id == a.plan_id:
             ahead = {p.tobytes() for p in points(a)}
-            assert all(p.tobytes() in ahead for p in points(b)), "the same plan again is the rest of the same line"
+            assert all(p.tobytes() in ahead for p in points(b)), (
+                "the same plan again is the rest of the same line"
+            )
 
 
 def test_the_plan_begins_at_the_robot_and_keeps_off_walls() -> None:
     rig = driving()
     for _ in range(60):
         rig.tick()
-        plan = rig.plan
+        plan = rig.last()
         assert math.hypot(plan.x_m[0] - rig.x_m, plan.y_m[0] - rig.y_m) < 0.45
         assert min(rig.clearance_at(x, y) for x, y in points(plan)) > FOOTPRINT_M
 
@@ -75,7 +78,12 @@ def test_what_is_kept_of_the_old_policy_stays_as_it_was_to_the_bit() -> None:
         before = rig.plans[-1] if rig.plans else None
         rig.tick()
         after = rig.plans[-1] if rig.plans else None
-        if before is None or after is None or after.plan_id == before.plan_id or not (before.valid and after.valid):
+        if (
+            before is None
+            or after is None
+            or after.plan_id == before.plan_id
+            or not (before.valid and after.valid)
+        ):
             continue
         old = {p.tobytes() for p in points(before)}
         assert after.kept_points > 0, "tau covers latency and braking: the junction lies ahead of the robot"
@@ -90,7 +98,7 @@ def test_tau_covers_planning_latency_and_braking() -> None:
     for _ in range(120):
         before, speed = len(rig.requests), rig.speed_mps
         rig.tick()
-        if len(rig.requests) == before or len(rig.plans) < 3 or not rig.plan.valid:
+        if len(rig.requests) == before or len(rig.plans) < 3 or not rig.last().valid:
             continue
         wanted = rig.requests[-1]
         ahead_s = (wanted.junction_ns - wanted.stamp_ns) / SECOND_NS
@@ -121,7 +129,7 @@ def test_the_same_world_and_seed_give_the_same_bytes() -> None:
 def test_the_paper_profile_keeps_more() -> None:
     taus = {}
     for profile in ("default", "paper"):
-        rig = Rig(config=Config(simulations=256, profile=profile))  # type: ignore[arg-type]
+        rig = Rig(config=Config(simulations=256, profile=profile))
         rig.run(8.0)
         taus[profile] = np.mean([(w.junction_ns - w.stamp_ns) / SECOND_NS for w in rig.requests[1:]])
     assert taus["paper"] > 1.5 * taus["default"]
@@ -134,25 +142,25 @@ def test_a_frozen_risk_map_holds_within_a_period_of_its_limit() -> None:
     rig = driving()
     rig.send_risk, last = False, (rig.ticks // 2 * 2) * TICK_NS
     while rig.now - last <= FEW.risk_stale_s * SECOND_NS:
-        assert rig.plan.valid
+        assert rig.last().valid
         rig.tick()
     assert rig.now - last <= FEW.risk_stale_s * SECOND_NS + TICK_NS
-    assert not rig.plan.valid
-    assert rig.plan.safety is SafetyState.HOLD
-    assert "risk map" in rig.plan.reason
-    assert len(rig.plan.x_m) == 0
-    held = rig.plan.plan_id
+    assert not rig.last().valid
+    assert rig.last().safety is SafetyState.HOLD
+    assert "risk map" in rig.last().reason
+    assert len(rig.last().x_m) == 0
+    held = rig.last().plan_id
     rig.send_risk = True
     rig.run(0.3)
-    assert rig.plan.valid and rig.plan.plan_id > held
+    assert rig.last().valid and rig.last().plan_id > held
 
 
 def test_a_frozen_pose_holds() -> None:
     rig = driving()
     rig.send_odometry = False
     rig.run(FEW.odometry_stale_s + 0.1)
-    assert not rig.plan.valid
-    assert rig.plan.safety is SafetyState.HOLD
+    assert not rig.last().valid
+    assert rig.last().safety is SafetyState.HOLD
 
 
 def test_nothing_is_emitted_before_the_first_pose_and_risk_map() -> None:
@@ -161,35 +169,37 @@ def test_nothing_is_emitted_before_the_first_pose_and_risk_map() -> None:
     assert rig.plans == [] and rig.requests == []
 
 
-@pytest.mark.parametrize(("switch", "after_s"), [("send_irm", FEW.irm_stale_s), ("answer", FEW.policy_silent_s)])
+@pytest.mark.parametrize(
+    ("switch", "after_s"), [("send_irm", FEW.irm_stale_s), ("answer", FEW.policy_silent_s)]
+)
 def test_a_silent_planner_degrades_and_the_robot_slows_down(switch: str, after_s: float) -> None:
     rig = driving(config=Config(simulations=256, max_kept_m=30.0))
     setattr(rig, switch, False)
     rig.run(after_s + 1.6)
-    assert rig.plan.safety is SafetyState.DEGRADED
+    assert rig.last().safety is SafetyState.DEGRADED
     limit = FEW.degraded_speed_share * FEW.max_speed_mps
-    assert rig.plan.valid and rig.plan.speed_mps.max() <= limit + 1e-9
+    assert rig.last().valid and rig.last().speed_mps.max() <= limit + 1e-9
     setattr(rig, switch, True)
     rig.run(2.0)
-    assert rig.plan.safety is SafetyState.RUN
-    assert rig.plan.speed_mps.max() > limit
+    assert rig.last().safety is SafetyState.RUN
+    assert rig.last().speed_mps.max() > limit
 
 
 def test_a_pause_holds_at_once_and_no_episode_is_opened_meanwhile() -> None:
     rig = driving()
     rig.phase = MissionPhase.PAUSED
     rig.tick()
-    assert not rig.plan.valid
-    assert rig.plan.safety is SafetyState.HOLD
-    assert "paused" in rig.plan.reason
+    assert not rig.last().valid
+    assert rig.last().safety is SafetyState.HOLD
+    assert "paused" in rig.last().reason
     asked, place = len(rig.requests), (rig.x_m, rig.y_m)
     rig.run(8.0)
     assert len(rig.requests) == asked
     assert math.dist(place, (rig.x_m, rig.y_m)) < 1e-9
     rig.phase = MissionPhase.EXPLORE
     rig.run(0.2)
-    assert rig.plan.valid
-    assert rig.plan.safety is SafetyState.RUN, "the time of the pause is not lcp's silence"
+    assert rig.last().valid
+    assert rig.last().safety is SafetyState.RUN, "the time of the pause is not lcp's silence"
 
 
 @pytest.mark.parametrize(
@@ -205,7 +215,7 @@ def test_the_mission_rules(phase: MissionPhase, safety: SafetyState, moves: bool
     rig = driving()
     rig.phase = phase
     rig.tick()
-    assert (rig.plan.safety, rig.plan.valid) == (safety, moves)
+    assert (rig.last().safety, rig.last().valid) == (safety, moves)
 
 
 # --- hazards ------------------------------------------------------------------------------------------------------
@@ -214,26 +224,26 @@ def test_the_mission_rules(phase: MissionPhase, safety: SafetyState, moves: bool
 def test_a_hazard_on_the_driven_path_truncates_it_in_the_first_step_that_shows_it() -> None:
     rig = driving(4.1)
     assert rig.ticks % 2 == 0
-    before = rig.plan
+    before = rig.last()
     x, y = points(before)[25]
     rig.wall_at(x, y)
     rig.tick()
-    assert points(rig.plan)[-1].tobytes() == points(before)[-1].tobytes(), "no risk map has shown it yet"
+    assert points(rig.last())[-1].tobytes() == points(before)[-1].tobytes(), "no risk map has shown it yet"
     rig.tick()
-    after = rig.plan
+    after = rig.last()
     assert after.plan_id > before.plan_id
     assert after.valid and len(after.x_m) < 30
     assert after.speed_mps[-1] == 0.0
     assert "hazard" in after.reason
     assert min(rig.clearance_at(px, py) for px, py in points(after)) > FOOTPRINT_M - 0.05
     rig.run(8.0)
-    assert rig.plan.valid and len(rig.plan.x_m) > 10, "it goes another way"
-    assert min(rig.clearance_at(px, py) for px, py in points(rig.plan)) > FOOTPRINT_M - 0.05
+    assert rig.last().valid and len(rig.last().x_m) > 10, "it goes another way"
+    assert min(rig.clearance_at(px, py) for px, py in points(rig.last())) > FOOTPRINT_M - 0.05
 
 
 def test_ground_that_is_not_known_any_more_is_a_hazard() -> None:
     rig = driving(4.1)
-    x, y = points(rig.plan)[25]
+    x, y = points(rig.last())[25]
     row, column = rig.grid.cell_of(x, y)
     unknown = rig.risk_map()
     state = unknown.state.copy()
@@ -242,21 +252,21 @@ def test_ground_that_is_not_known_any_more_is_a_hazard() -> None:
     rig.tick()
     rig.reconciler.put(RISK_MAP, unknown.model_copy(update={"state": state}), rig.now)
     rig.tick()
-    assert len(rig.plan.x_m) < 30
-    assert "hazard" in rig.plan.reason
+    assert len(rig.last().x_m) < 30
+    assert "hazard" in rig.last().reason
 
 
 def test_a_hazard_that_was_none_gives_the_path_back() -> None:
     rig = driving(4.1)
     clean = rig.lethal.copy()
-    end = points(rig.plan)[-1].copy()
-    rig.wall_at(*points(rig.plan)[25])
+    end = points(rig.last())[-1].copy()
+    rig.wall_at(*points(rig.last())[25])
     rig.answer = False
     rig.run(0.2)
-    assert len(rig.plan.x_m) < 30
+    assert len(rig.last().x_m) < 30
     rig.lethal = clean
     rig.run(0.2)
-    np.testing.assert_array_equal(points(rig.plan)[-1], end)
+    np.testing.assert_array_equal(points(rig.last())[-1], end)
 
 
 # --- episodes -----------------------------------------------------------------------------------------------------
@@ -273,12 +283,12 @@ def test_answers_to_old_episodes_are_dropped() -> None:
 def test_an_answer_that_nobody_asked_for_changes_nothing() -> None:
     rig = driving()
     stale = rig.delivered[-1]
-    before = rig.plan
+    before = rig.last()
     rig.moving = False
     rig.reconciler.put(LOCAL_POLICY, stale, rig.now)
     rig.tick()
-    assert rig.plan.plan_id == before.plan_id
-    np.testing.assert_array_equal(points(rig.plan)[-1], points(before)[-1])
+    assert rig.last().plan_id == before.plan_id
+    np.testing.assert_array_equal(points(rig.last())[-1], points(before)[-1])
 
 
 def test_one_episode_at_a_time() -> None:
@@ -292,24 +302,24 @@ def test_one_episode_at_a_time() -> None:
 def test_off_its_path_it_plans_from_where_the_robot_is() -> None:
     rig = driving()
     rig.moving = False
-    line = points(rig.plan)
+    line = points(rig.last())
     places = [(x, y) for x in np.arange(-4.0, 4.0, 0.5) for y in np.arange(-3.0, 3.0, 0.5)]
     rig.x_m, rig.y_m = max(places, key=lambda p: float(np.hypot(line[:, 0] - p[0], line[:, 1] - p[1]).min()))
     assert np.hypot(line[:, 0] - rig.x_m, line[:, 1] - rig.y_m).min() > FEW.off_path_m
     rig.tick()
-    assert not rig.plan.valid
-    assert rig.plan.reason == "off the path"
+    assert not rig.last().valid
+    assert rig.last().reason == "off the path"
     rig.run(1.5)
-    assert rig.plan.valid
-    assert math.hypot(rig.plan.x_m[0] - rig.x_m, rig.plan.y_m[0] - rig.y_m) < 1e-6
-    assert rig.plan.kept_points == 0
+    assert rig.last().valid
+    assert math.hypot(rig.last().x_m[0] - rig.x_m, rig.last().y_m[0] - rig.y_m) < 1e-6
+    assert rig.last().kept_points == 0
 
 
 def test_blocked_for_long_it_drops_the_path() -> None:
     rig = driving()
     rig.moving, rig.follower_blocked = False, True
     rig.run(FEW.blocked_s - 0.1)
-    assert rig.plan.valid
+    assert rig.last().valid
     seen = len(rig.plans)
     rig.run(0.6)
     dropped = [plan for plan in rig.plans[seen:] if plan.reason == "blocked"]
@@ -319,17 +329,17 @@ def test_blocked_for_long_it_drops_the_path() -> None:
 def test_after_a_restart_ids_go_on_increasing() -> None:
     rig = driving()
     rig.moving = False
-    last, asked = rig.plan.plan_id, len(rig.requests)
+    last, asked = rig.last().plan_id, len(rig.requests)
     snapshot = rig.reconciler.stage.snapshot()
     stage = create(FEW, StageSetup("robot", 3))
     stage.restore(snapshot)
     rig.reconciler.stage = stage
     rig.answers.clear()
     rig.run(2.0)
-    assert all(plan.plan_id > last for plan in rig.plans if plan is rig.plan)
+    assert all(plan.plan_id > last for plan in rig.plans if plan is rig.last())
     assert rig.requests[asked].episode == asked + 1
-    assert rig.plan.valid
-    assert math.hypot(rig.plan.x_m[0] - rig.x_m, rig.plan.y_m[0] - rig.y_m) < 0.1
+    assert rig.last().valid
+    assert math.hypot(rig.last().x_m[0] - rig.x_m, rig.last().y_m[0] - rig.y_m) < 0.1
 
 
 def test_the_stage_runs_on_risk_maps_and_answers() -> None:

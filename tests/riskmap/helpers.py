@@ -68,9 +68,7 @@ def sweep(
     return np.concatenate(rings).astype(np.float32)
 
 
-def cloud(
-    walls: Sequence[Wall], x_m: float, y_m: float, stamp_ns: int, yaw_rad: float = 0.0
-) -> PointCloud:
+def cloud(walls: Sequence[Wall], x_m: float, y_m: float, stamp_ns: int, yaw_rad: float = 0.0) -> PointCloud:
     """One sweep as a message."""
     pose = Pose(x_m=x_m, y_m=y_m, z_m=SENSOR_Z_M, yaw_rad=yaw_rad)
     return PointCloud(stamp_ns=stamp_ns, sensor_in_odom=pose, range_m=20.0, points_m=sweep(walls, pose))
@@ -91,7 +89,9 @@ def odometry(x_m: float, y_m: float, yaw_rad: float = 0.0, stamp_ns: int = 0) ->
 Feed = tuple[Topic[Message], Message]
 
 
-def received(message: Message, age_s: float = 0.0, fresh: bool = True, stale: bool = False) -> Received[Message]:
+def received(
+    message: Message, age_s: float = 0.0, fresh: bool = True, stale: bool = False
+) -> Received[Message]:
     """A message as a driver hands it to a stage."""
     return Received(message, "sim", 1, 1, message.stamp_ns, round(age_s * SECOND_NS), fresh, stale)
 

@@ -90,9 +90,7 @@ def test_rho_from_evidence_through_the_footprint_is_that_of_the_closed_form() ->
         result = layers(np.full(spec.shape, -1.5, np.float32), resolution_m=resolution_m)
         hazard = footprint_hazard(result.hazard_mean, 0.335, resolution_m)
         x, y = spec.ix0 * resolution_m, spec.iy0 * resolution_m
-        length, total = segment_risk(
-            hazard, resolution_m, spec.ix0, spec.iy0, x + 2, y + 2, x + 5, y + 6
-        )
+        length, total = segment_risk(hazard, resolution_m, spec.ix0, spec.iy0, x + 2, y + 2, x + 5, y + 6)
         p, floor = 1 / (1 + math.exp(1.5)), 1 / (1 + math.exp(CLAMP))
         assert length == pytest.approx(5.0)
         assert total == pytest.approx(5.0 * HAZARD_PER_M * (p - floor) / (1 - floor), rel=1e-4)

@@ -72,6 +72,7 @@ class _Point(NamedTuple):
 
     x: float
     y: float
+    angle: float
     bearing: int
     reach: float
     hit: bool
@@ -88,30 +89,34 @@ def _read_points(cloud: NDArray[np.float32], x: float, y: float, z: float, yaw: 
         bearing = math.floor((math.atan2(dy, dx) % (2 * math.pi)) / (2 * math.pi) * BEARINGS) % BEARINGS
         over = z + pz > BODY_M
         reach = distance * (BODY_M - z) / pz if over and z <= BODY_M else (0.0 if over else distance)
-        found.append(_Point(x + dx, y + dy, bearing, reach, GROUND_M < z + pz <= BODY_M))
+        angle = math.atan2(dy, dx)
+        found.append(_Point(x + dx, y + dy, angle, bearing, reach, GROUND_M < z + pz <= BODY_M))
     return found
 
 
 def _brute_force(
     spec: GridSpec, cloud: NDArray[np.float32], x: float, y: float, z: float, yaw: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """(hit, surely passed, perhaps passed): a ray that grazes a cell by less than 1e-6 cells is a matter of rounding."""
+    """(hit, surely passed, perhaps passed): a ray within 1e-6 cells of a corner is a matter of rounding."""
     hit = np.zeros(spec.shape, np.bool_)
-    reach = np.zeros(BEARINGS)
+    reach, angle = np.zeros(BEARINGS), np.zeros(BEARINGS)
     for point in _read_points(cloud, x, y, z, yaw):
         row, column = spec.cell_of(point.x, point.y)
         if point.hit and spec.contains(row, column):
             hit[row, column] = True
-        reach[point.bearing] = max(reach[point.bearing], point.reach)
+        if point.reach > reach[point.bearing]:
+            reach[point.bearing], angle[point.bearing] = point.reach, point.angle
     low_x = (spec.ix0 + np.arange(spec.width)[None, :]) - x / spec.resolution_m
     low_y = (spec.iy0 + np.arange(spec.height)[:, None]) - y / spec.resolution_m
     sure, maybe = np.zeros(spec.shape, np.bool_), np.zeros(spec.shape, np.bool_)
-    reaches = np.stack((reach, np.minimum(reach, np.roll(reach, -1))), axis=1).ravel()  # and between two bearings
+    # Each bearing's own ray, and between two of them the shorter one.
+    reaches = np.stack((reach, np.minimum(reach, np.roll(reach, -1))), axis=1).ravel()
+    between = angle + 0.5 * np.vectorize(math.remainder)(np.roll(angle, -1) - angle, 2 * math.pi)
+    angles = np.stack((angle, between), axis=1).ravel()
     for half in np.flatnonzero(reaches / spec.resolution_m > 0.5):
-        angle = 2 * math.pi * (0.5 * half + 0.5) / BEARINGS
         enter = np.zeros(spec.shape)
         leave = np.full(spec.shape, np.inf)
-        for low, slope in ((low_x, math.cos(angle)), (low_y, math.sin(angle))):
+        for low, slope in ((low_x, math.cos(angles[half])), (low_y, math.sin(angles[half]))):
             a, b = low / slope, (low + 1.0) / slope
             enter, leave = np.maximum(enter, np.minimum(a, b)), np.minimum(leave, np.maximum(a, b))
         length = reaches[half] / spec.resolution_m - 0.5
@@ -237,6 +242,25 @@ def test_a_moved_obstacle_fades_and_the_clearance_comes_back() -> None:
     after = layers_of(window)
     assert (after.state[(slice(40, 50), slice(50, 60))] == 1).all()
     assert after.clearance_m[cell] == pytest.approx(Config().max_clearance_m)
+
+
+def test_rays_that_graze_a_wall_do_not_wipe_it_out() -> None:
+    """A robot drives 10 m along a corridor; the walls that it passed are still there, far behind."""
+    walls = rectangle(-18.0, -1.03, 18.0, 1.07)
+    rng = np.random.default_rng(0)
+    window = OccupancyWindow(40.0, 0.1)
+    for k in range(101):
+        x, yaw = -10.0 + 0.1 * k, 0.002 * k
+        cloud = sweep(walls, Pose(x_m=x, z_m=SENSOR_Z_M, yaw_rad=yaw))
+        noise = rng.normal(0.0, 0.01, len(cloud)) / np.linalg.norm(cloud, axis=1)
+        integrate(window, (cloud * (1.0 + noise[:, None])).astype(np.float32), x, 0.0, yaw)
+    state = layers_of(window).state
+    row, column = window.spec.cell_of(-9.95, 1.07)
+    wall = state[row, column : column + 100]
+    assert (wall == 2).mean() > 0.9
+    assert (wall[-70:] == 2).all()
+    row, column = window.spec.cell_of(-9.95, 0.05)
+    assert (state[row, column : column + 100] == 1).all()
 
 
 def test_evidence_is_bounded() -> None:

@@ -29,9 +29,7 @@ def step(
     room: RiskMapStage, now_ns: int, x_m: float = 0.0, y_m: float = 0.0, stamp_ns: int | None = None
 ) -> Outputs:
     stamp = now_ns if stamp_ns is None else stamp_ns
-    return room.step(
-        now_ns, inputs((CLOUD, cloud(ROOM, x_m, y_m, stamp)), (ODOMETRY, odometry(x_m, y_m)))
-    )
+    return room.step(now_ns, inputs((CLOUD, cloud(ROOM, x_m, y_m, stamp)), (ODOMETRY, odometry(x_m, y_m))))
 
 
 def risk_map(outputs: Outputs) -> RiskMap:
@@ -143,7 +141,9 @@ def test_a_snapshot_goes_on_with_the_same_bytes(news: bool) -> None:
         found = [
             room.step(
                 k * TENTH,
-                merged(inputs((CLOUD, cloud(ROOM, 0.1 * k, 0, k * TENTH))), inputs((ODOMETRY, odometry(0, 0)))),
+                merged(
+                    inputs((CLOUD, cloud(ROOM, 0.1 * k, 0, k * TENTH))), inputs((ODOMETRY, odometry(0, 0)))
+                ),
             )
             if k > 7
             else room.step(k * TENTH, inputs())

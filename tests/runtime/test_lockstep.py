@@ -113,7 +113,9 @@ def test_a_trigger_causes_a_step_at_once_and_restarts_the_period(lockstep: Calla
     assert mission.seen == [(0, []), (57 * MS, [50 * MS]), (1057 * MS, [])]
 
 
-def test_messages_go_to_the_readers_of_the_table_and_to_nobody_else(lockstep: Callable[..., Lockstep]) -> None:
+def test_messages_go_to_the_readers_of_the_table_and_to_nobody_else(
+    lockstep: Callable[..., Lockstep],
+) -> None:
     sim = Scripted(MISSION, sends_odometry)
     gcp, lcp = Scripted(ODOMETRY), Scripted(PLAN)
     driver = lockstep(
@@ -196,7 +198,9 @@ def digest(lockstep: Callable[..., Lockstep], fakes: Fakes, end: int = 500 * MS)
     return driver.digest()
 
 
-def test_the_digest_is_the_same_for_the_same_run_and_not_for_another(lockstep: Callable[..., Lockstep]) -> None:
+def test_the_digest_is_the_same_for_the_same_run_and_not_for_another(
+    lockstep: Callable[..., Lockstep],
+) -> None:
     first = digest(lockstep, answering())
     assert first == digest(lockstep, answering())
     assert first != digest(lockstep, answering(after=1))

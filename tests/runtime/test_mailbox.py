@@ -80,7 +80,9 @@ def test_what_a_step_has_seen_stays_readable_and_is_no_longer_fresh() -> None:
     assert [r.fresh for r in inbox.inputs(2).new(ODOMETRY)] == [True]
 
 
-def test_a_queue_that_nobody_empties_loses_its_oldest_and_counts_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_queue_that_nobody_empties_loses_its_oldest_and_counts_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(mailbox_module, "_KEEP_ALL_LIMIT", 4)
     inbox = box()
     for number in range(1, 8):
@@ -117,7 +119,9 @@ def test_a_new_life_of_the_writer_begins_its_sequence_anew() -> None:
     assert inbox.accept(ODOMETRY, pose(1.0, epoch=1, sequence=500), 0)
     assert inbox.accept(ODOMETRY, pose(2.0, epoch=2, sequence=1), 0)
     assert not inbox.accept(ODOMETRY, pose(3.0, epoch=1, sequence=501), 0)
-    assert inbox.accept(ODOMETRY, pose(4.0, epoch=2, sequence=7), 0), "gaps are allowed: latest-only links drop"
+    assert inbox.accept(ODOMETRY, pose(4.0, epoch=2, sequence=7), 0), (
+        "gaps are allowed: latest-only links drop"
+    )
 
 
 def test_the_order_is_remembered_over_a_step() -> None:
@@ -190,10 +194,14 @@ def test_outputs_name_exactly_the_inputs_that_were_looked_at() -> None:
     inputs.current(ODOMETRY)
     inputs.latest(MISSION)
     out = Outbox("robot", "sim", 3)
-    _, named = decode(out.pack(Output(ODOMETRY, odometry(1, 0.0)), 1, inputs.consumed), ODOMETRY.message, 10**6)
+    _, named = decode(
+        out.pack(Output(ODOMETRY, odometry(1, 0.0)), 1, inputs.consumed), ODOMETRY.message, 10**6
+    )
     assert named.consumed == {ODOMETRY.name: (4, 9)}, "not what nobody looked at, nor what never came"
     inputs.new(COMMAND)
-    _, named = decode(out.pack(Output(ODOMETRY, odometry(1, 0.0)), 1, inputs.consumed), ODOMETRY.message, 10**6)
+    _, named = decode(
+        out.pack(Output(ODOMETRY, odometry(1, 0.0)), 1, inputs.consumed), ODOMETRY.message, 10**6
+    )
     assert named.consumed == {ODOMETRY.name: (4, 9), COMMAND.name: (1, 2)}
 
 
