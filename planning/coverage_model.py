@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from planning.bits import count_bits, lowest_bit
 from planning.grid import DIRECTION_DX, DIRECTION_DY
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 from planning.lattice_graph import travel_costs
 from planning.pomcp import random_below, random_bits, random_uniform, register_model, simulate
 from planning.reward import RewardParameters, action_cost, reward, travel_discount
@@ -87,7 +87,7 @@ def wedge_rows(reach: int, fov_rad: float) -> NDArray[np.uint32]:
     return rows
 
 
-@njit
+@njit_borrowing
 def new_nodes(
     footprint: NDArray[np.uint64],
     row_low: NDArray[np.int32],
@@ -104,7 +104,7 @@ def new_nodes(
     return total
 
 
-@njit
+@njit_borrowing
 def look(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64]) -> float:
     """Cover what is seen from (node, heading). Returns I, the sum of the entropies of the newly covered nodes."""
     return _look(
@@ -112,7 +112,7 @@ def look(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint
     )
 
 
-@njit
+@njit_borrowing
 def _look(
     footprint: NDArray[np.uint64],
     row_low: NDArray[np.int32],
@@ -137,7 +137,7 @@ def _look(
     return information
 
 
-@njit
+@njit_borrowing
 def edge_blocked(model: CoverageModel, key: int, node: int, k: int) -> bool:
     """Whether the edge is blocked in the simulation with this key: the same answer each time and from both ends."""
     rho = model.edge_risk[node, k]
@@ -152,13 +152,13 @@ def edge_blocked(model: CoverageModel, key: int, node: int, k: int) -> bool:
     return float(x >> np.uint64(11)) * (1.0 / 9007199254740992.0) < rho
 
 
-@njit
+@njit_borrowing
 def turn_share(heading: int, k: int) -> float:
     """mu(q): the turn to direction k as a share of half a turn, 0 to 1."""
     return _TURN[heading, k]
 
 
-@njit
+@njit_borrowing
 def _move(
     model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], k: int
 ) -> tuple[float, float, float, bool]:
@@ -175,7 +175,7 @@ def _move(
     return information, action_cost(model.weights, distance, risk, turn), distance, False
 
 
-@njit
+@njit_borrowing
 def best_gain_direction(
     model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int
 ) -> int:
@@ -199,7 +199,7 @@ def best_gain_direction(
     return best
 
 
-@njit
+@njit_borrowing
 def cluster_left(model: CoverageModel, c: int, covered: NDArray[np.uint64]) -> bool:
     """Whether a node of the group is still uncovered."""
     for r in range(3):
@@ -209,7 +209,7 @@ def cluster_left(model: CoverageModel, c: int, covered: NDArray[np.uint64]) -> b
     return False
 
 
-@njit
+@njit_borrowing
 def nearest_cluster(model: CoverageModel, node: int, covered: NDArray[np.uint64]) -> int:
     """The uncovered group that is the shortest way off (not one whose viewpoint this is), or -1."""
     nearest, nearest_cost = -1, np.float32(np.inf)
@@ -221,7 +221,7 @@ def nearest_cluster(model: CoverageModel, node: int, covered: NDArray[np.uint64]
     return nearest
 
 
-@njit
+@njit_borrowing
 def informed_move(
     model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int, group: int
 ) -> tuple[int, int]:
@@ -243,7 +243,7 @@ def informed_move(
     return (-1, -1) if (tried >> k) & 1 else (k, group)
 
 
-@njit
+@njit_borrowing
 def _discount(model: CoverageModel, node: int, k: int, distance: float) -> float:
     """Discount of a move: of the whole edge, or (blocked) of what was driven of it."""
     if distance == model.edge_distance_m[node, k]:

@@ -55,11 +55,11 @@ class GridSpec(NamedTuple):
 
     def centres_x(self) -> NDArray[np.float64]:
         """x of the column centres in metres, shape (width,)."""
-        return (self.ix0 + np.arange(self.width) + 0.5) * self.resolution_m
+        return (self.ix0 + np.arange(self.width, dtype=np.float64) + 0.5) * self.resolution_m
 
     def centres_y(self) -> NDArray[np.float64]:
         """y of the row centres in metres, shape (height,)."""
-        return (self.iy0 + np.arange(self.height) + 0.5) * self.resolution_m
+        return (self.iy0 + np.arange(self.height, dtype=np.float64) + 0.5) * self.resolution_m
 
 
 def window_around(x_m: float, y_m: float, size_m: float, resolution_m: float) -> GridSpec:

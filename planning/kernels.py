@@ -48,3 +48,13 @@ def njit(function: _Function) -> _Function:
     result does not depend on how the compiler reorders a sum.
     """
     return cast(_Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
+def njit_borrowing(function: _Function) -> _Function:
+    """As `njit`, for inner kernels that make no arrays and keep none: their arguments are borrowed.
+
+    numba counts references of every array of a tuple that a call hands on, with atomic instructions; in kernels that
+    hand a model of two dozen arrays to small functions that was most of the time. A function that would have to count
+    (one that allocates or slices) is refused at compilation.
+    """
+    return cast(_Function, numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function))

@@ -41,7 +41,11 @@ class Header(BaseModel):
     """A frozen pydantic model that refuses unknown keys and numbers that are not finite."""
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, arbitrary_types_allowed=True, ser_json_bytes="base64"
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        arbitrary_types_allowed=True,
+        ser_json_bytes="base64",
     )
 
 

@@ -140,7 +140,11 @@ def _unpack_column(label: str, packed: Any) -> np.ndarray[Any, Any]:
     name, shape, raw = packed
     if not isinstance(name, str) or name not in _DTYPES:
         raise ShapeError(f"{label}: type {name!r} is not allowed")
-    if not isinstance(shape, list) or len(shape) > _MAX_AXES or not all(isinstance(s, int) and s >= 0 for s in shape):
+    if (
+        not isinstance(shape, list)
+        or len(shape) > _MAX_AXES
+        or not all(isinstance(s, int) and s >= 0 for s in shape)
+    ):
         raise ShapeError(f"{label}: shape {shape!r} is not allowed")
     dtype = np.dtype(name).newbyteorder("<")
     expected = dtype.itemsize

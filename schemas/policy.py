@@ -39,7 +39,9 @@ class GlobalPolicy(Message):
     target_q: float
     target_distance_m: float = Field(ge=0)
     target_risk: float = Field(ge=0, le=1)
-    switched: bool = Field(description="The target replaced one that was still valid, reachable and uncovered.")
+    switched: bool = Field(
+        description="The target replaced one that was still valid, reachable and uncovered."
+    )
     reason: str
     alternatives: list[Alternative]
     map_to_odom: Pose

@@ -133,7 +133,9 @@ class CoverageSummary(Message):
     reachable_area_m2: float = Field(ge=0)
     covered_area_m2: float = Field(ge=0)
     covered_fraction: float = Field(ge=0, le=1)
-    entropy_left: float = Field(ge=0, description="Summed entropy of reachable ground, nats of whole patches.")
+    entropy_left: float = Field(
+        ge=0, description="Summed entropy of reachable ground, nats of whole patches."
+    )
     frontiers: int = Field(ge=0)
     frontier_gain: float = Field(ge=0)
     breadcrumbs: int = Field(ge=0)

@@ -17,10 +17,10 @@ class Config(BaseModel):
     reward: RewardWeights = RewardWeights()
     particles: int = Field(32, ge=1, le=4096, description="Samples of the robot's pose: the belief b(q).")
     switch_margin_relative: float = Field(
-        1.0, ge=0, le=10, description="The target is left for one whose Q is better by this share of |Q|, and"
+        2.0, ge=0, le=10, description="The target is left for one whose Q is better by this share of |Q|, and"
     )
     switch_margin: float = Field(
-        5.0, ge=0, le=1000, description="better by this much too, nats: more keeps the target longer."
+        12.0, ge=0, le=1000, description="better by this much too, nats: more keeps the target longer."
     )
     same_target_m: float = Field(
         2.0, gt=0, le=20, description="A frontier so near to the target's place is the same target, m."

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from planning.clusters import label_components
 from planning.coverage import LOG_2
-from planning.grid import UNKNOWN
+from planning.grid import FREE, LETHAL, UNKNOWN
 from planning.kernels import njit
 from services.irm.config import Config
 from services.irm.window import Window
@@ -32,6 +32,8 @@ class Frontier:
     beside_s: float = 0.0
     best_gain: float = math.inf
     seen: bool = True
+    missed: int = 0
+    isolated: int = 0
 
 
 @dataclass(slots=True)
@@ -68,17 +70,39 @@ class FrontierManager:
                 continue
             taken.add(index)
             frontier = self.frontiers[node_id]
+            if math.hypot(found[index][0] - frontier.x_m, found[index][1] - frontier.y_m) > 0.5:
+                frontier.beside_s = 0.0
             frontier.x_m, frontier.y_m, frontier.gain = found[index]
-            frontier.seen = True
+            frontier.seen, frontier.missed = True, 0
         for frontier in inside:
             if not frontier.seen:
-                del self.frontiers[frontier.node_id]
+                self._miss(frontier, window, now_ns)
         for index, (x, y, gain) in enumerate(found):
             if index not in taken:
                 self.frontiers[next_id] = Frontier(next_id, x, y, gain)
                 next_id += 1
         self._watch(robot, now_ns, elapsed_s)
         return next_id
+
+    def _miss(self, frontier: Frontier, window: Window, now_ns: int) -> None:
+        """A frontier in the window that was not found again: covered, forgotten by the risk map, or cut off."""
+        row, column = window.spec.cell_of(frontier.x_m, frontier.y_m)
+        reach = round(1.0 / window.spec.resolution_m)
+        near = (
+            slice(max(0, row - reach), row + reach + 1),
+            slice(max(0, column - reach), column + reach + 1),
+        )
+        looked = window.probability[near] >= self.config.covered_probability
+        open_ground = (window.state[near] != LETHAL) & ~looked & (window.ground[near] | (window.state[near] == FREE))
+        if not open_ground.any():
+            del self.frontiers[frontier.node_id]
+        elif window.state[row, column] != UNKNOWN:
+            frontier.missed += 1
+            if frontier.missed > self.config.missed_rounds:
+                if window.free_space[near].any():
+                    del self.frontiers[frontier.node_id]
+                else:
+                    self.give_up(frontier, "cut off: no way for the robot was found", now_ns)
 
     @staticmethod
     def _pairs(found: list[tuple[float, float, float]], old: list[Frontier]) -> list[tuple[float, int, int]]:

@@ -53,6 +53,7 @@ class Roadmap:
         self._sync_frontiers()
         self._join_robot(search)
         self._join_frontiers(window)
+        self._give_up_isolated(now_ns)
         self._review_edges(window)
 
     def _place_robot(self, x_m: float, y_m: float) -> None:
@@ -143,6 +144,14 @@ class Roadmap:
             data["joined_at"] = (f.x_m, f.y_m)
             if not joined and self.graph.has_edge(ROBOT, node) and self.graph.has_edge(ROBOT, self.last_breadcrumb):
                 self._join_over_robot(node)
+
+    def _give_up_isolated(self, now_ns: int) -> None:
+        """Frontiers that no edge has led to for long cannot be planned for."""
+        for node, f in sorted(self.manager.frontiers.items()):
+            f.isolated = 0 if self.graph.degree(node) else f.isolated + 1
+            if f.isolated > 3 * self.config.missed_rounds:
+                self.manager.give_up(f, "no way over the graph", now_ns)
+                self.graph.remove_node(node)
 
     def _join_over_robot(self, node: int) -> None:
         """No breadcrumb within d_e: join over the robot's place, which is within d_b of its last breadcrumb."""

@@ -15,6 +15,7 @@ from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
 from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
 from schemas.world import LocalIrm
+from services.lcp.problem import weighted_entropy
 from services.lcp.stage import Config, LcpStage, create, spec
 from tests.lcp.local_irms import IX0, IY0, anchor_of, global_policy, local_irm, mission, request
 from tests.planning.coverage_lattices import STEPS, Edge, Reference, random_lattice
@@ -221,6 +222,41 @@ def test_little_is_covered_where_the_target_itself_lies() -> None:
     assert phase_of(answer(feed, request(lattice, 4 * SIZE + 2))) is LocalPhase.COVER
     feed.put(GLOBAL_POLICY, global_policy([at(2), at(30)]), 1)
     assert phase_of(answer(feed, request(lattice, 4 * SIZE + 2, episode=2))) is LocalPhase.GUIDE
+
+
+def test_a_policy_that_is_worth_little_gives_way_to_the_target() -> None:
+    lattice = corridor({8: 0.3})
+    phases = []
+    for least in (0.0, 50.0):
+        feed = feed_of(
+            lattice, FAST.model_copy(update={"cover_begin_entropy": 0.2, "cover_min_value": least})
+        )
+        feed.put(GLOBAL_POLICY, global_policy([at(-20), at(-30)]), 0)
+        phases.append(phase_of(answer(feed, request(lattice, 4 * SIZE + 2))))
+    assert phases[0] is LocalPhase.COVER
+    assert phases[1] is LocalPhase.COVER, (
+        "there is no way to the target from here: covering is better than nothing"
+    )
+    feed.put(GLOBAL_POLICY, global_policy([at(2), at(0)]), 1)
+    assert phase_of(answer(feed, request(lattice, 4 * SIZE + 2, episode=2))) is LocalPhase.GUIDE
+
+
+@pytest.mark.parametrize(("weight", "least"), [(0.0, 0.0), (3.0, 0.3), (1.0, 0.0)])
+def test_ground_left_behind_counts_more(weight: float, least: float) -> None:
+    """By the share of the known neighbours that are covered; with both numbers at 0 it is the paper's reward."""
+    lattice = random_lattice(8, SIZE, 2, wall_share=0.2, covered_share=0.5)
+    irm = local_irm(lattice)
+    config = FAST.model_copy(update={"leftover_weight": weight, "leftover_gain": least})
+    found = weighted_entropy(irm, lattice.entropy, config)
+    for node in range(SIZE * SIZE):
+        if lattice.entropy[node] == 0.0:
+            assert found[node] == 0.0
+            continue
+        around = [o for k in range(8) if (o := lattice.neighbour(node, k)) >= 0]
+        known = [o for o in around if irm.state[o] == 1 or lattice.entropy[o] > 0.0]
+        covered = [o for o in known if lattice.entropy[o] == 0.0]
+        share = len(covered) / max(len(known), 1)
+        assert math.isclose(found[node], max(lattice.entropy[node], least) * (1.0 + weight * share))
 
 
 def test_on_the_way_back_nothing_is_covered() -> None:

@@ -181,7 +181,8 @@ def random_lattice(
 ) -> Reference:
     """A lattice of random entropies.
 
-    wall_share: nodes that are not there. risky_share: edges with rho from 0.05 to 0.85. hidden_share: nodes in range that are not in sight after all. covered_share: nodes of entropy 0.
+    wall_share: nodes that are not there. risky_share: edges with rho from 0.05 to 0.85. hidden_share: nodes in range
+    that are not in sight after all. covered_share: nodes of entropy 0.
     """
     rng = np.random.default_rng(seed)
     n = size * size

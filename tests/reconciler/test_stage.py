@@ -315,6 +315,21 @@ def test_off_its_path_it_plans_from_where_the_robot_is() -> None:
     assert rig.last().kept_points == 0
 
 
+def test_dropping_the_path_drops_the_episode_that_was_to_continue_it() -> None:
+    rig = driving()
+    rig.answer_delay, asked = 8, len(rig.requests)
+    while len(rig.requests) == asked:
+        rig.tick()
+    rig.moving = False
+    rig.x_m, rig.y_m = rig.x_m + (3.0 if rig.x_m < 0.0 else -3.0), -rig.y_m
+    rig.tick()
+    assert rig.last().reason == "off the path"
+    while rig.delivered[-1].episode < rig.requests[asked].episode:
+        rig.tick()
+    assert not rig.last().valid, "the answer continues a path that the robot has left"
+    assert len(rig.requests) > asked + 1, "another episode was opened at once"
+
+
 def test_blocked_for_long_it_drops_the_path() -> None:
     rig = driving()
     rig.moving, rig.follower_blocked = False, True
