@@ -44,7 +44,7 @@ class Config(BaseModel):
     frontier_min_gain: float = Field(0.2, gt=0, le=10, description="Less is not a frontier, nats of patches.")
     frontier_same_m: float = Field(2.5, ge=0, le=20, description="A frontier this near to an old one is that one.")
     missed_rounds: int = Field(8, ge=0, le=1000, description="Rounds that a cut-off frontier is waited for.")
-    unknown_depth_m: float = Field(1.0, ge=0, le=20, description="Unknown ground expected behind a border, m.")
+    unknown_depth_m: float = Field(0.5, ge=0, le=20, description="Unknown ground expected behind a border, m.")
     unknown_max_gain: float = Field(3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats.")
     give_up_s: float = Field(6.0, gt=0, le=600, description="Time beside a frontier that yields nothing, s.")
     give_up_radius_m: float = Field(1.5, gt=0, le=10, description="How near that is, m.")

@@ -87,6 +87,8 @@ class FrontierManager:
     def _miss(self, frontier: Frontier, window: Window, now_ns: int) -> None:
         """A frontier in the window that was not found again: covered, forgotten by the risk map, or cut off."""
         row, column = window.spec.cell_of(frontier.x_m, frontier.y_m)
+        if window.state[row, column] == UNKNOWN:
+            return
         reach = round(1.0 / window.spec.resolution_m)
         near = (
             slice(max(0, row - reach), row + reach + 1),
@@ -96,13 +98,13 @@ class FrontierManager:
         open_ground = (window.state[near] != LETHAL) & ~looked & (window.ground[near] | (window.state[near] == FREE))
         if not open_ground.any():
             del self.frontiers[frontier.node_id]
-        elif window.state[row, column] != UNKNOWN:
-            frontier.missed += 1
-            if frontier.missed > self.config.missed_rounds:
-                if window.free_space[near].any():
-                    del self.frontiers[frontier.node_id]
-                else:
-                    self.give_up(frontier, "cut off: no way for the robot was found", now_ns)
+            return
+        frontier.missed += 1
+        if frontier.missed > self.config.missed_rounds:
+            if window.free_space[near].any():
+                del self.frontiers[frontier.node_id]
+            else:
+                self.give_up(frontier, "cut off: no way for the robot was found", now_ns)
 
     @staticmethod
     def _pairs(found: list[tuple[float, float, float]], old: list[Frontier]) -> list[tuple[float, int, int]]:
@@ -157,23 +159,26 @@ def find_frontiers(window: Window, config: Config) -> list[tuple[float, float, f
     """The frontiers of a window: (x, y, expected information gain), in a fixed order.
 
     The uncovered ground is split into connected pieces; the border of a piece with covered ground is cut into blocks
-    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach.
+    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Ground that
+    is covered but borders on the unknown (the way around a corner) is open too: it counts what may lie behind.
     """
     s = window.spec
     labels = np.zeros(s.shape, np.int32)
-    pieces = label_components(window.uncovered, labels)
+    unknown = solid_unknown(window.state)
+    open_ground = window.uncovered | (window.ground & beside(unknown))
+    pieces = label_components(open_ground, labels)
     if pieces == 0:
         return []
     block = np.full(s.shape, -1, np.int32)
     cells = max(1, round(config.frontier_block_m / s.resolution_m))
-    covered = window.ground & ~window.uncovered
-    blocks = mark_borders(window.uncovered, covered, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block)
+    covered = window.ground & ~open_ground
+    blocks = mark_borders(open_ground, covered, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block)
     if blocks == 0:
         return []
     reach = round(config.frontier_reach_m / s.resolution_m)
-    spread_blocks(window.uncovered, block, reach, blocks)
+    spread_blocks(open_ground, block, reach, blocks)
     gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
-    block_gains(window.entropy, solid_unknown(window.state), block, gain, sums, hidden)
+    block_gains(window.entropy, unknown, block, gain, sums, hidden)
     unknown_gain = config.unknown_depth_m * s.resolution_m * LOG_2 / config.spacing_m**2
     gain += np.minimum(hidden * unknown_gain, config.unknown_max_gain)
     places = block_places(window.free_space, block, sums, round(1.0 / s.resolution_m))
@@ -190,6 +195,13 @@ def solid_unknown(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     solid: NDArray[np.bool_] = unknown & (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] >= 6)
     return solid
+
+
+def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells with a side in common with a cell of the mask."""
+    padded = np.pad(mask, 1)
+    near: NDArray[np.bool_] = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+    return near
 
 
 def _select(

@@ -32,9 +32,9 @@ class Config(BaseModel):
         4.0, ge=0, le=600, description="Covered when there was nothing left to go to for so long, s."
     )
     no_progress_s: float = Field(
-        300.0, gt=0, description="Give up when exploring so long without progress, s; pauses do not count."
+        600.0, gt=0, description="Give up when exploring so long without progress, s; pauses do not count."
     )
-    progress_min_m2: float = Field(1.0, gt=0, description="Newly covered ground that counts as progress, m2.")
+    progress_min_m2: float = Field(0.5, gt=0, description="Newly covered ground that counts as progress, m2.")
     progress_min_m: float = Field(
         1.0, gt=0, description="On the way back: so much less of the way left counts as progress, m."
     )
