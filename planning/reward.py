@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from planning.kernels import njit
@@ -23,6 +25,10 @@ class RewardWeights(BaseModel):
     k_distance_per_m: float = Field(0.05, ge=0, le=100, description="k_d, per metre: more is lazier.")
     k_risk: float = Field(5.0, ge=0, le=1000, description="k_rho, per unit of rho: more is more careful.")
     k_turn: float = Field(0.1, ge=0, le=100, description="k_mu, for half a turn (mu = 1).")
+    leftover_weight: float = Field(
+        3.0, ge=0, le=100, description="A patch amid covered ones counts so much more: leaving it costs a way back."
+    )
+    leftover_gain: float = Field(0.3, ge=0, le=0.7, description="Least that an uncovered patch counts, nats.")
     gamma_per_m: float = Field(0.985, gt=0, le=1, description="Discount for a metre travelled.")
 
 
@@ -47,6 +53,28 @@ def parameters(weights: RewardWeights) -> RewardParameters:
         float(weights.k_turn),
         float(weights.gamma_per_m),
     )
+
+
+def leftover_entropy(
+    entropy: NDArray[np.float64], known: NDArray[np.bool_], size: int, weights: RewardWeights
+) -> NDArray[np.float64]:
+    """Entropy of the nodes of a lattice as the local planners count it: leaving ground behind costs a way back.
+
+    entropy: (n,), 0 where covered. known: (n,), traversable nodes. An uncovered patch counts at least leftover_gain,
+    and (1 + leftover_weight f) times, f the share of its known neighbours that are covered. With both at 0 it is the
+    paper's reward; then a planner of finite horizon leaves every sliver for later, as fresh ground pays more at once.
+    """
+    wanted, traversable = (entropy > 0.0).reshape(size, size), known.reshape(size, size)
+    done, neighbours = np.zeros((size, size)), np.zeros((size, size))
+    padded_done, padded_known = np.pad(traversable & ~wanted, 1), np.pad(traversable | wanted, 1)
+    for dy in range(3):
+        for dx in range(3):
+            if (dy, dx) != (1, 1):
+                done += padded_done[dy : dy + size, dx : dx + size]
+                neighbours += padded_known[dy : dy + size, dx : dx + size]
+    share = (done / np.maximum(neighbours, 1.0)).ravel()
+    counted = np.maximum(entropy, weights.leftover_gain) * (1.0 + weights.leftover_weight * share)
+    return np.where(entropy > 0.0, counted, 0.0)
 
 
 @njit

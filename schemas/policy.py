@@ -87,6 +87,7 @@ class LocalPhase(StrEnum):
 class LocalPolicy(Message):
     """The answer to an episode request: a belief policy on the Local IRM of that version, in `odom`.
 
+    root_value: of the policy at the junction; rollout_value: of the rollout rule alone, in the same model.
     path_*: the most likely branch from the junction: nodes (lattice indices, so that it keeps its meaning when the
     window rolls), the expected reward of each step, and whether the tree or its rollout gave it. path_xy_m with
     path_node_point: the driven line, and the index of each node's point in it. tree_*: the policy with its observation
@@ -102,6 +103,7 @@ class LocalPolicy(Message):
     reason: str
     target: int = Field(ge=-1)
     root_value: float
+    rollout_value: float
     simulations: int = Field(ge=0)
     tree_nodes: int = Field(ge=0)
     planning_ms: float = Field(ge=0, description="0 in lock-step, where time is not measured.")

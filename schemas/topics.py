@@ -97,7 +97,7 @@ COVERAGE_WINDOW: Topic[CoverageWindow] = _topic(
     max_bytes=1 * _MIB, link=True,
 )  # fmt: skip
 GLOBAL_POLICY: Topic[GlobalPolicy] = _topic(
-    GlobalPolicy, "gcp/global_policy", "lcp mission status reconciler", "the QMDP policy, its target and why",
+    GlobalPolicy, "gcp/global_policy", "irm lcp mission status reconciler", "the QMDP policy, its target and why",
     period_ms=1000, stale_ms=10_000, max_bytes=16 * _MIB, link=True,
 )  # fmt: skip
 GCP_GRAPH_REQUEST: Topic[GraphRequest] = _topic(

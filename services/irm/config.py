@@ -47,6 +47,7 @@ class Config(BaseModel):
     unknown_depth_m: float = Field(0.5, ge=0, le=20, description="Unknown ground expected behind a border, m.")
     unknown_max_gain: float = Field(3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats.")
     give_up_s: float = Field(6.0, gt=0, le=600, description="Time beside a frontier that yields nothing, s.")
+    pursue_s: float = Field(90.0, gt=0, le=3600, description="A target that comes no nearer is given up then, s.")
     give_up_radius_m: float = Field(1.5, gt=0, le=10, description="How near that is, m.")
     retry_after_s: float = Field(600.0, gt=0, le=1e5, description="A given-up frontier may come back then, s.")
     blocked_memory_s: float = Field(60.0, gt=0, le=1e4, description="Where the robot was blocked stays risky, s.")

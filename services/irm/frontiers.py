@@ -34,6 +34,8 @@ class Frontier:
     seen: bool = True
     missed: int = 0
     isolated: int = 0
+    pursued_s: float = 0.0
+    nearest_m: float = math.inf
 
 
 @dataclass(slots=True)
@@ -127,6 +129,18 @@ class FrontierManager:
                 f.beside_s += elapsed_s
             if f.beside_s > self.config.give_up_s:
                 self.give_up(f, "stood beside it and saw nothing new", now_ns)
+
+    def pursue(self, node_id: int, distance_m: float, now_ns: int, elapsed_s: float) -> None:
+        """The global planner's target is this frontier, so far away: give it up when the robot gets no nearer."""
+        f = self.frontiers.get(node_id)
+        if f is None:
+            return
+        if distance_m < f.nearest_m - 0.5 or f.gain < 0.9 * f.best_gain:
+            f.nearest_m, f.pursued_s = min(distance_m, f.nearest_m), 0.0
+            return
+        f.pursued_s += elapsed_s
+        if f.pursued_s > self.config.pursue_s:
+            self.give_up(f, "pursued in vain: the robot got no nearer", now_ns)
 
     def give_up(self, frontier: Frontier, reason: str, now_ns: int) -> None:
         """Take a frontier off the list for a while."""

@@ -10,6 +10,7 @@ from planning.frames import Planar
 from planning.grid import GridSpec
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
+from schemas.policy import GlobalPolicy
 from schemas.sensing import CoverageScan, Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import (
@@ -19,6 +20,7 @@ from schemas.topics import (
     FOLLOWER,
     GCP_GRAPH_REQUEST,
     GLOBAL_IRM,
+    GLOBAL_POLICY,
     LOCAL_IRM,
     MISSION_GRAPH_REQUEST,
     ODOMETRY,
@@ -92,7 +94,8 @@ class IrmStage:
         ]
         due = now - self._global_ns >= self._config.global_period_s * SECOND_NS - SECOND_NS // 100
         if due or asked:
-            found += self._global(now, window, odometry, bool(asked))
+            policy = inputs.current(GLOBAL_POLICY)
+            found += self._global(now, window, odometry, bool(asked), policy)
         return found
 
     def _allocate(self, risk: RiskMap) -> None:
@@ -145,12 +148,16 @@ class IrmStage:
             [(x, y) for _, x, y in self._penalties],
         )  # fmt: skip
 
-    def _global(self, now: Stamp, window: Window, odometry: Odometry, whole: bool) -> Outputs:
+    def _global(
+        self, now: Stamp, window: Window, odometry: Odometry, whole: bool, policy: GlobalPolicy | None
+    ) -> Outputs:
         # Neither the first round nor a gap in the inputs is time that the robot stood beside a frontier.
         since = (now - self._global_ns) / SECOND_NS
         elapsed = min(since, 2.0 * self._config.global_period_s) if self._global_ns >= 0 else 0.0
         self._global_ns = now
         place = planar(odometry.map_to_odom).compose(planar(odometry.pose))
+        if policy is not None:
+            self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, elapsed)
         self._roadmap.update(window, place.x_m, place.y_m, now, elapsed)
         first = self._roadmap.version == 0
         message = self._roadmap.message(odometry.pose, odometry.map_to_odom, now, whole or first)

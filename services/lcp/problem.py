@@ -55,28 +55,6 @@ def local_entropy(irm: LocalIrm) -> NDArray[np.float64]:
     return reachable_entropy(irm.entropy, irm.visible, irm.edge_distance_m, irm.size, irm.reach)
 
 
-def weighted_entropy(irm: LocalIrm, entropy: NDArray[np.float64], config: Config) -> NDArray[np.float64]:
-    """Entropy as the local planner counts it, (n,): what is left behind amid covered ground costs a way back.
-
-    A patch counts at least leftover_gain, and (1 + leftover_weight f) times, f the share of its known neighbours that
-    are covered. With both at 0 it is the paper's reward. Without it, a planner of finite horizon leaves every sliver
-    for later, as fresh ground always pays more at once.
-    """
-    size = irm.size
-    wanted = (entropy > 0.0).reshape(size, size)
-    known = (irm.state == 1).reshape(size, size)
-    done, all_known = np.zeros((size, size)), np.zeros((size, size))
-    padded_done, padded_known = np.pad(known & ~wanted, 1), np.pad(known | wanted, 1)
-    for dy in range(3):
-        for dx in range(3):
-            if (dy, dx) != (1, 1):
-                done += padded_done[dy : dy + size, dx : dx + size]
-                all_known += padded_known[dy : dy + size, dx : dx + size]
-    share = (done / np.maximum(all_known, 1.0)).ravel()
-    counted = np.maximum(entropy, config.leftover_gain) * (1.0 + config.leftover_weight * share)
-    return np.where(entropy > 0.0, counted, 0.0)
-
-
 def leaf_values(irm: LocalIrm, policy: GlobalPolicy | None, weights: RewardWeights) -> NDArray[np.float64]:
     """What the rest of the mission is worth from each node: the global values spread over the lattice. (n,)"""
     n = irm.size * irm.size

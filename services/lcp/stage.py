@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from planning.coverage_model import ACTIONS, BITS, search_coverage
+from planning.coverage_model import ACTIONS, BITS, rollout_value, search_coverage
 from planning.lattice_graph import travel_costs
-from planning.pomcp import PolicyTree, Pomcp
+from planning.pomcp import PolicyTree, Pomcp, random_stream
 from planning.randomness import stream
-from planning.reward import parameters
+from planning.reward import leftover_entropy, parameters
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
@@ -28,7 +28,6 @@ from services.lcp.problem import (
     local_entropy,
     node_at,
     planar,
-    weighted_entropy,
 )
 
 __all__ = ["Config", "LcpStage", "create", "spec"]
@@ -131,7 +130,7 @@ class LcpStage:
         policy: GlobalPolicy | None,
     ) -> LocalPolicy:
         leaf = leaf_values(irm, policy, self._config.weights)
-        counted = weighted_entropy(irm, entropy, self._config)
+        counted = leftover_entropy(entropy, irm.state == 1, irm.size, self._config.weights)
         model = coverage_model(irm, counted, leaf, junction, self._config)
         seed = int(stream(self._seed, "lcp", request.episode).integers(2**63))
         report = self._solver.search(
@@ -146,9 +145,12 @@ class LcpStage:
             guided = self._guide(now, request, irm, junction, policy)
             if guided.phase == LocalPhase.GUIDE:
                 return guided
+        rollout = rollout_value(
+            model, junction.node, junction.heading, model.covered, random_stream(seed), self._config.value_rollouts
+        )
         reason = f"covers: value {root.best_value:.2f} by {report.simulations} simulations"
         return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, moves, in_tree, tree,
-                       float(root.best_value), report.simulations, report.nodes)  # fmt: skip
+                       float(root.best_value), report.simulations, report.nodes, float(rollout))  # fmt: skip
 
     def _deadline(self) -> Callable[[], bool] | None:
         """Whether the planning time of this episode is over; None where time is not measured (lock-step)."""
@@ -222,6 +224,7 @@ def _policy(
     root_value: float,
     simulations: int,
     tree_nodes: int,
+    rollout: float = 0.0,
 ) -> LocalPolicy:
     nodes, points, at = line_of(irm, junction.node, moves)
     lattice = [(irm.ix0 + n % irm.size, irm.iy0 + n // irm.size) for n in nodes]
@@ -233,6 +236,7 @@ def _policy(
         reason=reason,
         target=policy.target if policy is not None else -1,
         root_value=root_value,
+        rollout_value=rollout,
         simulations=simulations,
         tree_nodes=tree_nodes,
         planning_ms=0.0,
@@ -260,6 +264,7 @@ def _nothing(now: Stamp, request: EpisodeRequest, reason: str) -> LocalPolicy:
         reason=reason,
         target=-1,
         root_value=0.0,
+        rollout_value=0.0,
         simulations=0,
         tree_nodes=0,
         planning_ms=0.0,

@@ -17,7 +17,7 @@ from planning.coverage_model import (
     reachable_entropy,
 )
 from planning.randomness import stream
-from planning.reward import parameters
+from planning.reward import leftover_entropy, parameters
 from planning.search import dijkstra_box, trace_path
 from schemas.sensing import Odometry
 from schemas.world import LocalIrm
@@ -52,7 +52,6 @@ class Opened:
     kept_lattice: NDArray[np.int64]
     kept_point: NDArray[np.int64]
     tau_s: float
-    rollout_value: float
     keeps_old: bool
     junction_point: int = 0
 
@@ -100,7 +99,7 @@ def model_here(irm: LocalIrm, node: int, heading: int, covered: NDArray[np.uint6
         fov_rad=irm.sensor_fov_rad,
         edge_distance_m=irm.edge_distance_m,
         edge_risk=irm.edge_risk,
-        entropy=entropy,
+        entropy=leftover_entropy(entropy, irm.state == 1, irm.size, config.weights),
         visible=irm.visible,
         leaf_value=np.zeros(irm.size * irm.size),
         root=root,

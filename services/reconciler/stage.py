@@ -6,9 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.coverage_model import rollout_value
 from planning.grid import GridSpec
-from planning.pomcp import random_stream
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.policy import EpisodeRequest, LocalPhase, LocalPolicy, Plan
 from schemas.sensing import FollowerState, Odometry
@@ -233,7 +231,6 @@ class ReconcilerStage:
             kept_lattice=committed.lattice[reachable[: kept + 1]],
             kept_point=committed.node_point[reachable[: kept + 1]] - self._at,
             tau_s=ahead[kept] / max(c.max_speed_mps, 0.1),
-            rollout_value=self._rollouts(model, node, self._heading(committed, reachable[kept]), covered),
             keeps_old=True,
             junction_point=point,
         )
@@ -252,11 +249,9 @@ class ReconcilerStage:
         heading = heading_index(odometry.pose.yaw_rad)
         if len(prefix) > 4:
             heading = heading_index(float(headings(prefix)[-1]))
-        model = model_here(irm, node, heading, covered, self._config)
         lattice = np.array([[irm.ix0 + node % irm.size, irm.iy0 + node // irm.size]], np.int64)
         opened = Opened(
-            self._episode, now, irm, prefix, lattice, np.array([len(prefix) - 1], np.int64), 0.0,
-            self._rollouts(model, node, heading, covered), False,
+            self._episode, now, irm, prefix, lattice, np.array([len(prefix) - 1], np.int64), 0.0, False,
         )  # fmt: skip
         return opened, self._request(now, irm, node, heading, odometry, covered, opened)
 
@@ -288,10 +283,6 @@ class ReconcilerStage:
             covered=covered,
         )
 
-    def _rollouts(self, model, node: int, heading: int, covered: NDArray[np.uint64]) -> float:  # type: ignore[no-untyped-def]
-        rng = random_stream(self._stream_seed())
-        return float(rollout_value(model, node, heading, covered, rng, self._config.replan_rollouts))
-
     def _stream_seed(self) -> int:
         return (self._seed * 1_000_003 + self._episode) & 0x7FFFFFFFFFFFFFFF
 
@@ -316,8 +307,8 @@ class ReconcilerStage:
         if policy.phase == LocalPhase.NONE or len(policy.path_lattice) == 0:
             self._why = policy.reason
             return
-        if policy.phase == LocalPhase.COVER and opened.rollout_value > 0.1:
-            ratio = min(max(policy.root_value / opened.rollout_value, 1.0), 2.0)
+        if policy.phase == LocalPhase.COVER and policy.rollout_value > 0.1:
+            ratio = min(max(policy.root_value / policy.rollout_value, 1.0), 2.0)
             self._value_ratio += 0.2 * (ratio - self._value_ratio)
         self._commit(opened, policy, odometry, ground)
         self._why = policy.reason

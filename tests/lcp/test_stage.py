@@ -15,7 +15,7 @@ from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
 from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
 from schemas.world import LocalIrm
-from services.lcp.problem import weighted_entropy
+from planning.reward import RewardWeights, leftover_entropy
 from services.lcp.stage import Config, LcpStage, create, spec
 from tests.lcp.local_irms import IX0, IY0, anchor_of, global_policy, local_irm, mission, request
 from tests.planning.coverage_lattices import STEPS, Edge, Reference, random_lattice
@@ -246,8 +246,8 @@ def test_ground_left_behind_counts_more(weight: float, least: float) -> None:
     """By the share of the known neighbours that are covered; with both numbers at 0 it is the paper's reward."""
     lattice = random_lattice(8, SIZE, 2, wall_share=0.2, covered_share=0.5)
     irm = local_irm(lattice)
-    config = FAST.model_copy(update={"leftover_weight": weight, "leftover_gain": least})
-    found = weighted_entropy(irm, lattice.entropy, config)
+    weights = RewardWeights(leftover_weight=weight, leftover_gain=least)
+    found = leftover_entropy(lattice.entropy, irm.state == 1, irm.size, weights)
     for node in range(SIZE * SIZE):
         if lattice.entropy[node] == 0.0:
             assert found[node] == 0.0
