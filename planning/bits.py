@@ -17,15 +17,15 @@ _TOP = np.uint64(56)
 
 
 @njit
-def count_bits(word: np.uint64) -> np.int64:
+def count_bits(word: np.uint64) -> int:
     """Number of set bits of a 64-bit word."""
     x = word - ((word >> _ONE) & _M1)
     x = (x & _M2) + ((x >> _TWO) & _M2)
     x = (x + (x >> _FOUR)) & _M4
-    return np.int64((x * _H01) >> _TOP)
+    return np.int64((x * _H01) >> _TOP)  # type: ignore[return-value]  # the compiler's int
 
 
 @njit
-def lowest_bit(word: np.uint64) -> np.int64:
+def lowest_bit(word: np.uint64) -> int:
     """Index of the lowest set bit of a word that is not 0."""
     return count_bits((word & (~word + _ONE)) - _ONE)

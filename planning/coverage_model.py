@@ -1,10 +1,10 @@
 """The local coverage problem as a generative model: motion and observation model and reward (paper, LCP and Eq. 5).
 
-Shared by lcp, reconciler and baselines. State (int64): node, heading, key of the simulation's risk outcomes, moves made,
-then one word a lattice row with the bits of the nodes that this simulation has covered. Actions: 0..7 one move in that
-direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule. Observation: blocked or not,
-and how much was newly covered, binned. Whether an edge is blocked is drawn once a simulation (a hash of its key), so
-that a blocked edge stays blocked and is worth finding out about.
+Shared by lcp, reconciler and baselines. State (int64): node, heading, key of the simulation's risk outcomes, moves
+made, then one word a lattice row with the bits of the nodes that this simulation has covered. Actions: 0..7 one move
+in that direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule. Observation:
+blocked or not, and how much was newly covered, binned. Whether an edge is blocked is drawn once a simulation (a hash
+of its key), so that a blocked edge stays blocked and is worth finding out about.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ from planning.bits import count_bits, lowest_bit
 from planning.grid import DIRECTION_DX, DIRECTION_DY
 from planning.kernels import njit, njit_borrowing
 from planning.lattice_graph import travel_costs
-from planning.pomcp import random_below, random_bits, random_uniform, register_model, simulate
+from planning.pomcp import (
+    SearchSettings,
+    Tree,
+    random_below,
+    random_bits,
+    random_uniform,
+    register_model,
+    simulate,
+)
 from planning.reward import RewardParameters, action_cost, reward, travel_discount
 
 NODE, HEADING, KEY, MOVES, BITS = 0, 1, 2, 3, 4
@@ -40,12 +48,13 @@ class CoverageModel(NamedTuple):
     """The Local IRM and what the simulations need of it; n nodes, size * size.
 
     step_to: (n, 8), the neighbour in each direction, -1 outside. top: (n,), lattice row of the footprint's first row.
-    edge_distance_m, edge_risk, edge_discount: (n, 8). entropy: (n,), nats of whole patches. footprint: (n, 8, rows), the nodes that the
-    sensor covers from a node under a heading, shifted to lattice columns. leaf_value: (n,). particle_*: (p,), the root belief. covered: (size,) bits that count as
-    covered already. row_low, row_high: (n,), the rows of the footprint that are not empty, half open. cluster_*: groups of
-    uncovered nodes for the informed rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_rows (c, 3)
-    words, cluster_top (c,) first row. horizon: moves of every simulation, in the tree and the rollout
-    together, so that values of short and of long actions compare.
+    edge_distance_m, edge_risk, edge_discount: (n, 8). entropy: (n,), nats of whole patches. footprint: (n, 8, rows),
+    the nodes that the sensor covers from a node under a heading, shifted to lattice columns. leaf_value: (n,).
+    particle_*: (p,), the root belief. covered: (size,) bits that count as covered already. row_low, row_high: (n,),
+    the rows of the footprint that are not empty, half open. cluster_*: groups of uncovered nodes for the informed
+    rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_rows (c, 3) words, cluster_top (c,) first row.
+    horizon: moves of every simulation, in the tree and the rollout together, so that values of short and of long
+    actions compare.
     """
 
     size: int
@@ -108,7 +117,15 @@ def new_nodes(
 def look(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64]) -> float:
     """Cover what is seen from (node, heading). Returns I, the sum of the entropies of the newly covered nodes."""
     return _look(
-        model.footprint, model.row_low, model.row_high, model.entropy, model.size, model.top[node], node, heading, covered
+        model.footprint,
+        model.row_low,
+        model.row_high,
+        model.entropy,
+        model.size,
+        model.top[node],
+        node,
+        heading,
+        covered,
     )
 
 
@@ -182,7 +199,12 @@ def best_gain_direction(
     """The move with the best one-step gain for its travel and risk, or -1 when no move covers anything."""
     node, heading = state[NODE], state[HEADING]
     footprint, row_low, row_high = model.footprint, model.row_low, model.row_high
-    edge_distance_m, edge_risk, step_to, tops = model.edge_distance_m, model.edge_risk, model.step_to, model.top
+    edge_distance_m, edge_risk, step_to, tops = (
+        model.edge_distance_m,
+        model.edge_risk,
+        model.step_to,
+        model.top,
+    )
     k_risk = model.weights.k_risk
     best, best_score = -1, 0.0
     for k in range(8):
@@ -228,18 +250,24 @@ def informed_move(
     """The informed rule: the next move (-1: nothing left to cover) and the group that it goes to (-1: none).
 
     The move with the best one-step gain for its cost, else towards the nearest uncovered group; tried: bits of
-    directions not to take. On the way to a group it does not waver: it looks again only when the group is covered or reached.
+    directions not to take. On the way to a group it does not waver: it looks again only when the group is covered or
+    reached.
     """
     node = state[NODE]
-    if group >= 0 and model.cluster_move[node, group] >= 0 and tried == 0 and cluster_left(model, group, covered):
-        return np.int64(model.cluster_move[node, group]), group
+    if (
+        group >= 0
+        and model.cluster_move[node, group] >= 0
+        and tried == 0
+        and cluster_left(model, group, covered)
+    ):
+        return np.int64(model.cluster_move[node, group]), group  # type: ignore[return-value]
     k = best_gain_direction(model, state, covered, tried)
     if k >= 0:
         return k, -1
     group = nearest_cluster(model, node, covered)
     if group < 0:
         return -1, -1
-    k = np.int64(model.cluster_move[node, group])
+    k = np.int64(model.cluster_move[node, group])  # type: ignore[assignment]  # the compiler's int
     return (-1, -1) if (tried >> k) & 1 else (k, group)
 
 
@@ -277,7 +305,11 @@ def _step(
         k = action % 8
         if action == SWEEP:
             k, group = informed_move(model, state, covered, 0, group)
-        if k < 0 or model.edge_distance_m[state[NODE], k] <= 0.0 or model.edge_risk[state[NODE], k] > MAX_EDGE_RISK:
+        if (
+            k < 0
+            or model.edge_distance_m[state[NODE], k] <= 0.0
+            or model.edge_risk[state[NODE], k] > MAX_EDGE_RISK
+        ):
             break
         start = state[NODE]
         state[MOVES] += 1
@@ -317,13 +349,15 @@ def _actions(model: CoverageModel, state: NDArray[np.int64], actions_out: NDArra
 
 
 @njit
-def _rollout(model: CoverageModel, state: NDArray[np.int64], depth_left: int, rng: NDArray[np.uint64]) -> float:
+def _rollout(
+    model: CoverageModel, state: NDArray[np.int64], depth_left: int, rng: NDArray[np.uint64]
+) -> float:
     covered = state[BITS:].view(np.uint64)
     value, discount, tried, group = 0.0, 1.0, 0, -1
     for _ in range(model.horizon - state[MOVES]):
         node, k = state[NODE], -1
         if random_uniform(rng) < model.rollout_random:
-            k, group = np.int64(random_below(rng, 8)), -1
+            k, group = np.int64(random_below(rng, 8)), -1  # type: ignore[assignment]
             if model.edge_distance_m[node, k] <= 0.0 or model.edge_risk[node, k] > 0.1:
                 k = -1
         if k < 0:
@@ -343,7 +377,9 @@ register_model(CoverageModel, sample=_sample, step=_step, actions=_actions, roll
 
 
 @njit
-def search_coverage(tree, model, settings, rng, simulations):  # type: ignore[no-untyped-def]
+def search_coverage(
+    tree: Tree, model: CoverageModel, settings: SearchSettings, rng: NDArray[np.uint64], simulations: int
+) -> None:
     """Entry point of POMCP for this model (see `planning.pomcp`)."""
     simulate(tree, model, settings, rng, simulations)
 
@@ -373,7 +409,7 @@ def evaluate_moves(
     distance_out: NDArray[np.float64],
     alive_out: NDArray[np.float64],
 ) -> int:
-    """Expected reward of each step of a path under the current belief (paper, Eq. 13).
+    """Expected reward of each step of a path under the current belief (paper, Eq. 17).
 
     moves: (k,) directions. covered: (size,), changed: what the path covers. A step that fails (probability rho) turns
     the robot, drives nowhere and ends the path; alive_out: probability of getting past the step. Exact when no edge
@@ -451,7 +487,9 @@ def best_viewpoint(
     """
     best, best_score = -1, 0.0
     for row in range(max(0, top - reach), min(size, top + 3 + reach)):
-        for column in range(max(0, int(middle_column) - 2 - reach), min(size, int(middle_column) + 3 + reach)):
+        for column in range(
+            max(0, int(middle_column) - 2 - reach), min(size, int(middle_column) + 3 + reach)
+        ):
             node = row * size + column
             if not math.isfinite(cost[node]):
                 continue
@@ -474,7 +512,13 @@ def best_viewpoint(
 
 @njit
 def _see_block(
-    visible: NDArray[np.uint32], node: int, size: int, reach: int, top: int, words: NDArray[np.uint64], seen: NDArray[np.uint64]
+    visible: NDArray[np.uint32],
+    node: int,
+    size: int,
+    reach: int,
+    top: int,
+    words: NDArray[np.uint64],
+    seen: NDArray[np.uint64],
 ) -> None:
     """Move the nodes of a block that a node sees (whatever its heading) from `words` to `seen`, (3,) each."""
     shift = node % size - reach
@@ -562,7 +606,9 @@ def clusters(
 
 
 @njit
-def _row_bounds(visible: NDArray[np.uint32], size: int, reach: int, low: NDArray[np.int32], high: NDArray[np.int32]) -> None:
+def _row_bounds(
+    visible: NDArray[np.uint32], size: int, reach: int, low: NDArray[np.int32], high: NDArray[np.int32]
+) -> None:
     """The rows of each node that lie in the lattice and are not empty, half open."""
     for node in range(size * size):
         low[node] = high[node] = 0
@@ -577,7 +623,11 @@ def _row_bounds(visible: NDArray[np.uint32], size: int, reach: int, low: NDArray
 
 @njit
 def _footprints(
-    visible: NDArray[np.uint32], wedge: NDArray[np.uint32], size: int, reach: int, footprint: NDArray[np.uint64]
+    visible: NDArray[np.uint32],
+    wedge: NDArray[np.uint32],
+    size: int,
+    reach: int,
+    footprint: NDArray[np.uint64],
 ) -> None:
     """What is visible and in the field of view, by node and heading, shifted to lattice columns; (n, 8, rows) out."""
     for node in range(size * size):
@@ -604,7 +654,7 @@ def reachable_entropy(
     reach: int,
 ) -> NDArray[np.float64]:
     """Entropy of each node that can be covered from some connected node; 0 for the others. (n,)"""
-    connected = (edge_distance_m > 0.0).any(axis=1)
+    connected: NDArray[np.bool_] = np.asarray((edge_distance_m > 0.0).any(axis=1))
     seen = np.zeros(size * size, np.bool_)
     seen_by_any(visible, connected, size, reach, seen)
     return np.where(seen, entropy, 0.0).astype(np.float64)
@@ -642,7 +692,10 @@ def build_model(
     move, cost, rows, top = clusters(entropy, size, reach, seen, distance, risk, risk_weight_m, start)
     low, high = np.zeros(size * size, np.int32), np.zeros(size * size, np.int32)
     _row_bounds(seen, size, reach, low, high)
-    step_to, top_row = lattice_steps(size), (np.arange(size * size, dtype=np.int32) // size - reach).astype(np.int32)
+    step_to, top_row = (
+        lattice_steps(size),
+        (np.arange(size * size, dtype=np.int32) // size - reach).astype(np.int32),
+    )
     footprint = np.zeros((size * size, 8, 2 * reach + 1), np.uint64)
     _footprints(seen, wedge_rows(reach, fov_rad), size, reach, footprint)
     return CoverageModel(

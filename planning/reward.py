@@ -26,7 +26,10 @@ class RewardWeights(BaseModel):
     k_risk: float = Field(5.0, ge=0, le=1000, description="k_rho, per unit of rho: more is more careful.")
     k_turn: float = Field(0.1, ge=0, le=100, description="k_mu, for half a turn (mu = 1).")
     leftover_weight: float = Field(
-        3.0, ge=0, le=100, description="A patch amid covered ones counts so much more: leaving it costs a way back."
+        3.0,
+        ge=0,
+        le=100,
+        description="A patch amid covered ones counts so much more: leaving it costs a way back.",
     )
     leftover_gain: float = Field(0.3, ge=0, le=0.7, description="Least that an uncovered patch counts, nats.")
     gamma_per_m: float = Field(0.985, gt=0, le=1, description="Discount for a metre travelled.")

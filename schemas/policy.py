@@ -1,4 +1,4 @@
-"""What the planners say to each other, and the one motion output (paper, Hierarchical Value Learning and Eq. 12-15)."""
+"""What the planners say to each other, and the one motion output (paper, Hierarchical Value Learning and Eq. 16-19)."""
 
 from __future__ import annotations
 

@@ -19,19 +19,28 @@ class Config(BaseModel):
     spacing_m: float = Field(1.0, ge=0.3, le=3, description="Node spacing of the Local IRM, m.")
     size: int = Field(41, ge=5, le=61, description="Nodes a side of the Local IRM, odd.")
     local_period_s: float = Field(0.5, ge=0.1, le=10, description="Time between Local IRMs, s.")
-    edge_detour: float = Field(1.6, ge=1, le=4, description="A bent edge may be this much longer than straight.")
+    edge_detour: float = Field(
+        1.6, ge=1, le=4, description="A bent edge may be this much longer than straight."
+    )
     min_node_entropy: float = Field(
-        0.08, ge=0, le=0.69, description="Patches with less entropy count as covered, nats (a whole one: 0.69)."
+        0.08,
+        ge=0,
+        le=0.69,
+        description="Patches with less entropy count as covered, nats (a whole one: 0.69).",
     )
     # coverage sensor, as the planners assume it
     sensor_range_m: float = Field(6.0, gt=0, le=100, description="Range of the coverage sensor, m.")
     sensor_fov_deg: float = Field(120.0, gt=0, le=360, description="Field of view of the coverage sensor.")
-    covered_probability: float = Field(0.9, gt=0.5, lt=1, description="From this probability a cell is covered.")
+    covered_probability: float = Field(
+        0.9, gt=0.5, lt=1, description="From this probability a cell is covered."
+    )
     # traversability
     clearance_margin_m: float = Field(0.0, ge=-0.05, le=1, description="Added to the footprint's radius, m.")
-    clearance_hysteresis_m: float = Field(0.03, ge=0, le=0.2, description="What was passable stays so, m.")
+    clearance_hysteresis_m: float = Field(0.015, ge=0, le=0.2, description="What was passable stays so, m.")
     hazard_margin_m: float = Field(0.1, ge=0, le=1, description="Hazard is felt this far around the body, m.")
-    comfort_clearance_m: float = Field(0.5, ge=0, le=3, description="Nearer to obstacles a path costs more, m.")
+    comfort_clearance_m: float = Field(
+        0.5, ge=0, le=3, description="Nearer to obstacles a path costs more, m."
+    )
     # Global IRM
     global_period_s: float = Field(1.0, ge=0.1, le=10, description="Time between Global IRMs, s.")
     breadcrumb_spacing_m: float = Field(2.0, gt=0.2, le=20, description="d_b: new breadcrumb beyond it, m.")
@@ -39,18 +48,34 @@ class Config(BaseModel):
     max_edge_risk: float = Field(0.6, gt=0, le=1, description="rho_e: no riskier edge.")
     edges_per_node: int = Field(6, ge=1, le=50, description="A new breadcrumb is joined to so many.")
     # frontiers
-    frontier_block_m: float = Field(5.0, ge=1, le=50, description="A frontier is no longer than about this, m.")
-    frontier_reach_m: float = Field(8.0, ge=1, le=50, description="Ground up to here counts for a frontier, m.")
+    frontier_block_m: float = Field(
+        5.0, ge=1, le=50, description="A frontier is no longer than about this, m."
+    )
+    frontier_reach_m: float = Field(
+        8.0, ge=1, le=50, description="Ground up to here counts for a frontier, m."
+    )
     frontier_min_gain: float = Field(0.2, gt=0, le=10, description="Less is not a frontier, nats of patches.")
-    frontier_same_m: float = Field(2.5, ge=0, le=20, description="A frontier this near to an old one is that one.")
+    frontier_same_m: float = Field(
+        2.5, ge=0, le=20, description="A frontier this near to an old one is that one."
+    )
     missed_rounds: int = Field(8, ge=0, le=1000, description="Rounds that a cut-off frontier is waited for.")
-    unknown_depth_m: float = Field(0.5, ge=0, le=20, description="Unknown ground expected behind a border, m.")
-    unknown_max_gain: float = Field(3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats.")
+    unknown_depth_m: float = Field(
+        0.5, ge=0, le=20, description="Unknown ground expected behind a border, m."
+    )
+    unknown_max_gain: float = Field(
+        3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats."
+    )
     give_up_s: float = Field(6.0, gt=0, le=600, description="Time beside a frontier that yields nothing, s.")
-    pursue_s: float = Field(90.0, gt=0, le=3600, description="A target that comes no nearer is given up then, s.")
+    pursue_s: float = Field(
+        90.0, gt=0, le=3600, description="A target that comes no nearer is given up then, s."
+    )
     give_up_radius_m: float = Field(1.5, gt=0, le=10, description="How near that is, m.")
-    retry_after_s: float = Field(600.0, gt=0, le=1e5, description="A given-up frontier may come back then, s.")
-    blocked_memory_s: float = Field(60.0, gt=0, le=1e4, description="Where the robot was blocked stays risky, s.")
+    retry_after_s: float = Field(
+        600.0, gt=0, le=1e5, description="A given-up frontier may come back then, s."
+    )
+    blocked_memory_s: float = Field(
+        60.0, gt=0, le=1e4, description="Where the robot was blocked stays risky, s."
+    )
 
     @model_validator(mode="after")
     def _fits_the_message(self) -> Config:

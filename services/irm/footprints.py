@@ -138,9 +138,7 @@ def _look(
     out = np.zeros(patch.shape, dtype=np.uint8)
     x_cells = pose.x_m / resolution - patch.ix0
     y_cells = pose.y_m / resolution - patch.iy0
-    visible_cells(
-        piece != FREE, x_cells, y_cells, scan.range_m / resolution, pose.yaw_rad, scan.fov_rad, out
-    )
+    visible_cells(piece != FREE, x_cells, y_cells, scan.range_m / resolution, pose.yaw_rad, scan.fov_rad, out)
     return patch, (out != 0) & (piece == FREE)
 
 

@@ -7,7 +7,7 @@ as no cell there can have changed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -97,7 +97,9 @@ class FrontierManager:
             slice(max(0, column - reach), column + reach + 1),
         )
         looked = window.probability[near] >= self.config.covered_probability
-        open_ground = (window.state[near] != LETHAL) & ~looked & (window.ground[near] | (window.state[near] == FREE))
+        open_ground = (
+            (window.state[near] != LETHAL) & ~looked & (window.ground[near] | (window.state[near] == FREE))
+        )
         if not open_ground.any():
             del self.frontiers[frontier.node_id]
             return
@@ -124,7 +126,7 @@ class FrontierManager:
         for node_id in sorted(self.frontiers):
             f = self.frontiers[node_id]
             if f.gain < 0.9 * f.best_gain:
-                f.best_gain, f.beside_s = f.gain, 0.0
+                f.best_gain, f.beside_s, f.pursued_s = f.gain, 0.0, 0.0
             if math.hypot(f.x_m - robot[0], f.y_m - robot[1]) <= self.config.give_up_radius_m:
                 f.beside_s += elapsed_s
             if f.beside_s > self.config.give_up_s:
@@ -135,8 +137,8 @@ class FrontierManager:
         f = self.frontiers.get(node_id)
         if f is None:
             return
-        if distance_m < f.nearest_m - 0.5 or f.gain < 0.9 * f.best_gain:
-            f.nearest_m, f.pursued_s = min(distance_m, f.nearest_m), 0.0
+        if distance_m < f.nearest_m - 0.5:
+            f.nearest_m, f.pursued_s = distance_m, 0.0
             return
         f.pursued_s += elapsed_s
         if f.pursued_s > self.config.pursue_s:
@@ -151,10 +153,7 @@ class FrontierManager:
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
         return {
-            "frontiers": [
-                [f.node_id, f.x_m, f.y_m, f.gain, f.beside_s, f.best_gain]
-                for _, f in sorted(self.frontiers.items())
-            ],
+            "frontiers": [list(astuple(f)) for _, f in sorted(self.frontiers.items())],
             "given_up": [[g.x_m, g.y_m, g.gain, g.reason, g.until_ns] for g in self.given_up],
         }
 
@@ -178,8 +177,8 @@ def find_frontiers(window: Window, config: Config) -> list[tuple[float, float, f
     """
     s = window.spec
     labels = np.zeros(s.shape, np.int32)
-    unknown = solid_unknown(window.state)
-    open_ground = window.uncovered | (window.ground & beside(unknown))
+    unknown = solid(window.unseen)
+    open_ground = window.uncovered | (window.ground & (window.state == FREE) & beside(unknown))
     pieces = label_components(open_ground, labels)
     if pieces == 0:
         return []
@@ -202,13 +201,12 @@ def find_frontiers(window: Window, config: Config) -> list[tuple[float, float, f
     return _select(gain, places, piece_of, window, config)
 
 
-def solid_unknown(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Unknown cells in the midst of unknown cells (6 of 9): gaps between far rays are not unexplored ground."""
-    unknown = state == UNKNOWN
-    padded = np.pad(unknown, 1, mode="edge").astype(np.uint8)
+def solid(unseen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Unseen cells in the midst of unseen cells (6 of 9): gaps between far rays are not unexplored ground."""
+    padded = np.pad(unseen, 1, mode="edge").astype(np.uint8)
     rows = padded[:-2] + padded[1:-1] + padded[2:]
-    solid: NDArray[np.bool_] = unknown & (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] >= 6)
-    return solid
+    kept: NDArray[np.bool_] = unseen & (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] >= 6)
+    return kept
 
 
 def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

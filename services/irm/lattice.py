@@ -79,7 +79,14 @@ def path_hazard(
     length, total = 0.0, 0.0
     for i in range(points_m.shape[0] - 1):
         d, h = segment_risk(
-            hazard, resolution_m, ix0, iy0, points_m[i, 0], points_m[i, 1], points_m[i + 1, 0], points_m[i + 1, 1]
+            hazard,
+            resolution_m,
+            ix0,
+            iy0,
+            points_m[i, 0],
+            points_m[i, 1],
+            points_m[i + 1, 0],
+            points_m[i + 1, 1],
         )
         length += d
         total += h
@@ -126,9 +133,9 @@ def connect_neighbours(
                 continue
             other = r * size + c
             x0, y0, x1, y1 = anchor_m[node, 0], anchor_m[node, 1], anchor_m[other, 0], anchor_m[other, 1]
-            if segment_min_clearance(clearance_m, resolution_m, ix0, iy0, x0, y0, x1, y1) >= needed_m and line_in(
-                free_space, resolution_m, ix0, iy0, x0, y0, x1, y1
-            ):
+            if segment_min_clearance(
+                clearance_m, resolution_m, ix0, iy0, x0, y0, x1, y1
+            ) >= needed_m and line_in(free_space, resolution_m, ix0, iy0, x0, y0, x1, y1):
                 d, h = segment_risk(hazard, resolution_m, ix0, iy0, x0, y0, x1, y1)
                 set_edge(node, other, k, d, h, distance_m, risk)
             else:
@@ -177,7 +184,14 @@ def connect_neighbours(
 
 @njit
 def line_in(
-    mask: NDArray[np.bool_], resolution_m: float, ix0: int, iy0: int, x0: float, y0: float, x1: float, y1: float
+    mask: NDArray[np.bool_],
+    resolution_m: float,
+    ix0: int,
+    iy0: int,
+    x0: float,
+    y0: float,
+    x1: float,
+    y1: float,
 ) -> bool:
     """Whether points every half cell of the segment lie in the mask."""
     steps = max(1, math.ceil(2.0 * math.hypot(x1 - x0, y1 - y0) / resolution_m))
@@ -235,7 +249,10 @@ def sum_patches(
 
 @njit
 def halve(
-    opaque: NDArray[np.bool_], mass: NDArray[np.float32], out_opaque: NDArray[np.bool_], out_mass: NDArray[np.float32]
+    opaque: NDArray[np.bool_],
+    mass: NDArray[np.float32],
+    out_opaque: NDArray[np.bool_],
+    out_mass: NDArray[np.float32],
 ) -> None:
     """Layers at half the resolution for visibility: opaque where two or more of four cells are; mass summed."""
     for row in range(out_opaque.shape[0]):

@@ -105,14 +105,17 @@ class LocalIrmBuilder:
         return anchor, state
 
     def _patch_sum(
-        self, window: Window, values: NDArray[np.float32], ix0: int, iy0: int, counted: NDArray[np.bool_] | None = None
+        self,
+        window: Window,
+        values: NDArray[np.float32],
+        ix0: int,
+        iy0: int,
+        counted: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         c, s = self.config, window.spec
         total, count = np.zeros(c.size * c.size), np.zeros(c.size * c.size, np.int64)
         mask = window.ground if counted is None else counted
-        sum_patches(
-            values, mask, s.resolution_m, c.spacing_m, s.ix0, s.iy0, ix0, iy0, c.size, total, count
-        )
+        sum_patches(values, mask, s.resolution_m, c.spacing_m, s.ix0, s.iy0, ix0, iy0, c.size, total, count)
         return total, count
 
     def _mean(

@@ -106,7 +106,11 @@ class Roadmap:
         return False
 
     def _sync_frontiers(self) -> None:
-        gone = [n for n, d in self.graph.nodes(data=True) if d["kind"] == FRONTIER and n not in self.manager.frontiers]
+        gone = [
+            n
+            for n, d in self.graph.nodes(data=True)
+            if d["kind"] == FRONTIER and n not in self.manager.frontiers
+        ]
         self.graph.remove_nodes_from(gone)
         for node, f in sorted(self.manager.frontiers.items()):
             self.graph.add_node(node, x=f.x_m, y=f.y_m, z=0.0, kind=FRONTIER, gain=f.gain, coverage=0.5)
@@ -142,7 +146,11 @@ class Roadmap:
                 if other != ROBOT and joined < 3:
                     joined += self._join(node, other, search)
             data["joined_at"] = (f.x_m, f.y_m)
-            if not joined and self.graph.has_edge(ROBOT, node) and self.graph.has_edge(ROBOT, self.last_breadcrumb):
+            if (
+                not joined
+                and self.graph.has_edge(ROBOT, node)
+                and self.graph.has_edge(ROBOT, self.last_breadcrumb)
+            ):
                 self._join_over_robot(node)
 
     def _give_up_isolated(self, now_ns: int) -> None:
@@ -157,7 +165,9 @@ class Roadmap:
         """No breadcrumb within d_e: join over the robot's place, which is within d_b of its last breadcrumb."""
         a, b = self.graph.edges[ROBOT, node], self.graph.edges[ROBOT, self.last_breadcrumb]
         rho = 1.0 - (1.0 - a["risk"]) * (1.0 - b["risk"])
-        self.graph.add_edge(node, self.last_breadcrumb, distance=a["distance"] + b["distance"], risk=rho, driven=0)
+        self.graph.add_edge(
+            node, self.last_breadcrumb, distance=a["distance"] + b["distance"], risk=rho, driven=0
+        )
 
     def _review_edges(self, window: Window) -> None:
         """Evaluate the edges of one nearby breadcrumb again, in turn: ground changes."""
@@ -221,9 +231,9 @@ class Roadmap:
             edge_risk=np.array([v[1] for _, v in edges], dtype=np.float64),
             edge_driven=np.array([v[2] for _, v in edges], dtype=np.uint8),
             removed_node=np.array(sorted(k for k in gone if isinstance(k, int)), dtype=np.int64),
-            removed_edge=np.array(
-                sorted(k for k in gone if isinstance(k, tuple)), dtype=np.int64
-            ).reshape(-1, 2),
+            removed_edge=np.array(sorted(k for k in gone if isinstance(k, tuple)), dtype=np.int64).reshape(
+                -1, 2
+            ),
         )
 
     def _contents(self) -> dict[Any, tuple[Any, ...]]:
@@ -287,9 +297,7 @@ class _Search:
         if cell is None:
             return math.inf, 1.0
         s = self._window.spec
-        distance, integral = path_totals(
-            self._parent, self._window.hazard, s.resolution_m, cell[0], cell[1]
-        )
+        distance, integral = path_totals(self._parent, self._window.hazard, s.resolution_m, cell[0], cell[1])
         return distance, 1.0 - math.exp(-integral)
 
     def knows(self, x_m: float, y_m: float) -> bool:

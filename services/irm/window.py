@@ -17,19 +17,23 @@ from schemas.world import RiskMap
 from services.irm.config import Config
 from services.irm.tiles import TileLayer
 
+KNOWN, GROUND = 2, 1
+"""Of the ground layer: seen but out of the robot's reach or an obstacle; ground that it can touch. 0: never seen."""
+
 
 @dataclass(slots=True)
 class Window:
     """What is known around the robot, all (h, w) over `spec` in `map`.
 
-    passable: the robot's centre fits. free_space: passable and connected to the robot. ground: what its body can
-    touch from there. uncovered: ground below the covered probability, slivers of one cell left out. entropy: of
-    uncovered cells, nats of whole patches (0 elsewhere). hazard: CVaR of the hazard rate, its mean under the body, 1/m.
-    step_cost: cost per metre of the grid search.
+    unseen: never known, not only forgotten by the risk map. passable: the robot's centre fits. free_space: passable
+    and connected to the robot. ground: what its body can touch from there. uncovered: ground below the covered
+    probability, slivers of one cell left out. entropy: of uncovered cells, nats of whole patches (0 elsewhere).
+    hazard: CVaR of the hazard rate, its mean under the body, 1/m. step_cost: cost per metre of the grid search.
     """
 
     spec: GridSpec
     state: NDArray[np.uint8]
+    unseen: NDArray[np.bool_]
     clearance_m: NDArray[np.float32]
     hazard: NDArray[np.float32]
     step_cost: NDArray[np.float32]
@@ -56,7 +60,8 @@ def build_window(
     """
     g = risk.grid
     spec = GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
-    before = ground_layer.read(spec) == 1
+    layer = ground_layer.read(spec)
+    before = layer == GROUND
     hazard = footprint_hazard(
         risk.hazard_cvar, risk.footprint_radius_m + config.hazard_margin_m, g.resolution_m
     )
@@ -73,7 +78,9 @@ def build_window(
     dilate_disc(free_space, risk.footprint_radius_m / g.resolution_m, ground)
     ground &= risk.state == FREE
     ground |= before & (risk.state == UNKNOWN)
-    ground_layer.write(spec, np.where(ground, 1, 0).astype(np.uint8))
+    layer[risk.state != UNKNOWN] = KNOWN
+    layer[ground] = GROUND
+    ground_layer.write(spec, layer)
     p = probability(coverage_layer.read(spec))
     uncovered = without_slivers(ground & (p < config.covered_probability))
     cell_share = (g.resolution_m / config.spacing_m) ** 2
@@ -81,6 +88,7 @@ def build_window(
     return Window(
         spec=spec,
         state=risk.state,
+        unseen=layer == 0,
         clearance_m=risk.clearance_m,
         hazard=hazard,
         step_cost=_step_cost(hazard, risk.clearance_m, needed, config.comfort_clearance_m),

@@ -15,14 +15,28 @@ class Config(BaseModel):
     weights: RewardWeights = RewardWeights()
     max_depth: int = Field(24, ge=1, le=200, description="Horizon of the tree, actions.")
     max_nodes: int = Field(40_000, ge=100, le=5_000_000, description="Histories that the tree can hold.")
-    exploration: float = Field(0.04, ge=0, le=10, description="UCB constant, in units of the range of returns.")
-    horizon: int = Field(40, ge=1, le=500, description="Moves of every simulation, tree and rollout together.")
+    exploration: float = Field(
+        0.04, ge=0, le=10, description="UCB constant, in units of the range of returns."
+    )
+    horizon: int = Field(
+        40, ge=1, le=500, description="Moves of every simulation, tree and rollout together."
+    )
     rollout_random: float = Field(0.1, ge=0, le=1, description="Share of random moves in rollouts.")
-    path_steps: int = Field(24, ge=1, le=500, description="Moves of the path that is given to the reconciler.")
+    path_steps: int = Field(
+        24, ge=1, le=500, description="Moves of the path that is given to the reconciler."
+    )
     value_rollouts: int = Field(64, ge=1, le=10_000, description="Rollouts for the value without planning.")
     min_visits: int = Field(12, ge=1, le=100_000, description="Tree nodes with fewer visits are not policy.")
-    cover_begin_entropy: float = Field(0.7, ge=0, le=100, description="So much in reach starts covering, nats.")
+    cover_begin_entropy: float = Field(
+        0.7, ge=0, le=100, description="So much in reach starts covering, nats."
+    )
     cover_end_entropy: float = Field(0.1, ge=0, le=100, description="Less in reach ends covering, nats.")
-    cover_min_value: float = Field(0.4, ge=0, le=100, description="A policy worth less gives way to the target.")
-    cover_radius_m: float = Field(14.0, ge=1, le=60, description="Ground up to here counts as in reach, m of travel.")
-    seconds_per_deadline: float = Field(0.3, ge=0.01, le=10, description="Live planning time of an episode, s.")
+    cover_min_value: float = Field(
+        0.4, ge=0, le=100, description="A policy worth less gives way to the target."
+    )
+    cover_radius_m: float = Field(
+        14.0, ge=1, le=60, description="Ground up to here counts as in reach, m of travel."
+    )
+    seconds_per_deadline: float = Field(
+        0.3, ge=0.01, le=10, description="Live planning time of an episode, s."
+    )

@@ -61,7 +61,11 @@ def _unfold(
         return [int(k) for k in rest[: follow_rule(model, node, heading, covered.copy(), rest)]]
     moves: list[int] = []
     k, most = action % 8, 1 if action < 8 else MACRO_STEPS
-    while len(moves) < most and model.edge_distance_m[node, k] > 0.0 and model.edge_risk[node, k] <= MAX_EDGE_RISK:
+    while (
+        len(moves) < most
+        and model.edge_distance_m[node, k] > 0.0
+        and model.edge_risk[node, k] <= MAX_EDGE_RISK
+    ):
         moves.append(k)
         node = neighbour(node, k, model.size)
     return moves
@@ -87,7 +91,9 @@ def moves_to(irm: LocalIrm, start: int, goal: int, risk_weight_m: float, max_ris
     return moves
 
 
-def line_of(irm: LocalIrm, start: int, moves: list[int]) -> tuple[list[int], list[tuple[float, float]], list[int]]:
+def line_of(
+    irm: LocalIrm, start: int, moves: list[int]
+) -> tuple[list[int], list[tuple[float, float]], list[int]]:
     """Nodes, the line through their anchors (with the inner points of bent edges), and each node's point in it."""
     bent = {int(e): b for b, e in enumerate(irm.bent_edge)}
     node = start

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
@@ -116,8 +117,11 @@ class LcpStage:
             return in_reach > 0.0
         x, y = planar(policy.map_to_odom).inverse().apply(*policy.target_xyz_m[:2])
         target = node_at(irm, x, y)
-        return target >= 0 and bool(np.isfinite(cost[target])) and float(entropy.sum()) > 0.0 and (
-            float(entropy[_near_reach(irm, cost, cost[target] + 3.0)].sum()) > 0.0
+        return (
+            target >= 0
+            and bool(np.isfinite(cost[target]))
+            and float(entropy.sum()) > 0.0
+            and (float(entropy[_near_reach(irm, cost, cost[target] + 3.0)].sum()) > 0.0)
         )
 
     def _cover(
@@ -146,7 +150,12 @@ class LcpStage:
             if guided.phase == LocalPhase.GUIDE:
                 return guided
         rollout = rollout_value(
-            model, junction.node, junction.heading, model.covered, random_stream(seed), self._config.value_rollouts
+            model,
+            junction.node,
+            junction.heading,
+            model.covered,
+            random_stream(seed),
+            self._config.value_rollouts,
         )
         reason = f"covers: value {root.best_value:.2f} by {report.simulations} simulations"
         return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, moves, in_tree, tree,
@@ -160,7 +169,12 @@ class LcpStage:
         return lambda: watch() > ends
 
     def _guide(
-        self, now: Stamp, request: EpisodeRequest, irm: LocalIrm, junction: Junction, policy: GlobalPolicy | None
+        self,
+        now: Stamp,
+        request: EpisodeRequest,
+        irm: LocalIrm,
+        junction: Junction,
+        policy: GlobalPolicy | None,
     ) -> LocalPolicy:
         """Phase 1: along the global path, as far as the Local IRM reaches."""
         if policy is None or len(policy.path_xyz_m) == 0:
@@ -204,7 +218,7 @@ def _near_reach(irm: LocalIrm, cost: np.ndarray, radius_m: float) -> np.ndarray:
 def _densify(places: list[tuple[float, float]]) -> list[tuple[float, float]]:
     """Points every half metre along a path."""
     dense = places[:1]
-    for (x0, y0), (x1, y1) in zip(places, places[1:], strict=False):
+    for (x0, y0), (x1, y1) in pairwise(places):
         steps = max(1, int(np.ceil(np.hypot(x1 - x0, y1 - y0) / 0.5)))
         dense += [(x0 + (x1 - x0) * i / steps, y0 + (y1 - y0) * i / steps) for i in range(1, steps + 1)]
     return dense

@@ -15,19 +15,26 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     profile: Literal["default", "paper"] = Field(
-        "default", description="paper: tau* by the literal rule; default: with regulariser and value of replanning."
+        "default",
+        description="paper: tau* by the literal rule; default: with regulariser and value of replanning.",
     )
     weights: RewardWeights = RewardWeights()
     # episodes
     episode_period_s: float = Field(1.5, ge=0.2, le=20, description="Time between planning episodes, s.")
-    episode_timeout_s: float = Field(3.0, ge=0.5, le=60, description="An unanswered episode is dropped then, s.")
+    episode_timeout_s: float = Field(
+        3.0, ge=0.5, le=60, description="An unanswered episode is dropped then, s."
+    )
     simulations: int = Field(4096, ge=1, le=10_000_000, description="POMCP simulations of an episode.")
     horizon_m: float = Field(30.0, gt=1, le=1000, description="Travel that a policy looks ahead, m.")
     particles: int = Field(32, ge=1, le=10_000, description="Particles of the junction belief.")
     # tau*
-    planning_latency_s: float = Field(0.6, ge=0, le=10, description="tau covers at least this and braking, s.")
+    planning_latency_s: float = Field(
+        0.6, ge=0, le=10, description="tau covers at least this and braking, s."
+    )
     max_kept_m: float = Field(8.0, gt=0, le=100, description="No more of the old path is kept, m.")
-    regulariser: float = Field(0.3, ge=0, le=100, description="lambda: weight of the mismatch at the junction.")
+    regulariser: float = Field(
+        0.3, ge=0, le=100, description="lambda: weight of the mismatch at the junction."
+    )
     replan_rollouts: int = Field(16, ge=1, le=1000, description="Rollouts for the value of replanning.")
     rollout_moves: int = Field(40, ge=1, le=500, description="Moves of those rollouts.")
     # motion limits
@@ -38,13 +45,21 @@ class Config(BaseModel):
     footprint_radius_m: float = Field(0.25, gt=0.05, le=2, description="The robot's disc, m.")
     tight_clearance_m: float = Field(0.3, gt=0, le=2, description="Up to here the slowest speed, m.")
     free_clearance_m: float = Field(0.6, gt=0, le=5, description="From here on no slowing down, m.")
-    comfort_clearance_m: float = Field(0.45, gt=0, le=2, description="Paths are pushed this far off walls, m.")
+    comfort_clearance_m: float = Field(
+        0.45, gt=0, le=2, description="Paths are pushed this far off walls, m."
+    )
     # safety
     plan_ttl_s: float = Field(1.5, gt=0.1, le=30, description="The follower stops without a newer plan, s.")
     risk_stale_s: float = Field(1.5, gt=0, le=30, description="Older risk maps hold the robot, s.")
     odometry_stale_s: float = Field(0.5, gt=0, le=30, description="Older poses hold the robot, s.")
     irm_stale_s: float = Field(3.0, gt=0, le=60, description="Older Local IRMs degrade, s.")
-    policy_silent_s: float = Field(6.0, gt=0, le=60, description="Without answers of lcp so long: degraded, s.")
-    degraded_speed_share: float = Field(0.5, gt=0, le=1, description="Share of the speed limits when degraded.")
+    policy_silent_s: float = Field(
+        6.0, gt=0, le=60, description="Without answers of lcp so long: degraded, s."
+    )
+    degraded_speed_share: float = Field(
+        0.5, gt=0, le=1, description="Share of the speed limits when degraded."
+    )
     off_path_m: float = Field(0.6, gt=0.05, le=5, description="Farther off its path the robot plans anew, m.")
-    blocked_s: float = Field(1.0, gt=0, le=60, description="Blocked or stuck so long, the path is dropped, s.")
+    blocked_s: float = Field(
+        1.0, gt=0, le=60, description="Blocked or stuck so long, the path is dropped, s."
+    )

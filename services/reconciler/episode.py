@@ -89,7 +89,9 @@ def moves_between(committed: Committed, first: int, last: int) -> NDArray[np.int
     return (np.round(yaw / (math.pi / 4.0)).astype(np.int64)) % 8
 
 
-def model_here(irm: LocalIrm, node: int, heading: int, covered: NDArray[np.uint64], config: Config) -> CoverageModel:
+def model_here(
+    irm: LocalIrm, node: int, heading: int, covered: NDArray[np.uint64], config: Config
+) -> CoverageModel:
     """The shared coverage model on this Local IRM, starting at a node."""
     entropy = reachable_entropy(irm.entropy, irm.visible, irm.edge_distance_m, irm.size, irm.reach)
     root = RootBelief(np.array([node], np.int32), np.array([heading], np.uint8), np.ones(1), covered)
@@ -171,7 +173,9 @@ def line_to_lattice(
     reach = math.ceil(3.0 * irm.spacing_m / s.resolution_m)
     box = (row - reach, row + reach + 1, column - reach, column + reach + 1)
     ones = np.ones(s.shape, np.float32)
-    dijkstra_box(ones, passable, s.resolution_m, row, column, box, np.empty((0, 2), np.int32), 8.0, cost, parent)
+    dijkstra_box(
+        ones, passable, s.resolution_m, row, column, box, np.empty((0, 2), np.int32), 8.0, cost, parent
+    )
     best: tuple[float, int, int, int] | None = None
     for node in range(irm.size * irm.size):
         if irm.state[node] != 1 or node in avoid or not (irm.edge_distance_m[node] > 0.0).any():
@@ -180,7 +184,9 @@ def line_to_lattice(
         if not (max(box[0], 0) <= r < min(box[1], s.height) and max(box[2], 0) <= c < min(box[3], s.width)):
             continue
         if np.isfinite(cost[r, c]):
-            yaw = math.atan2(irm.anchor_m[node, 1] - odometry.pose.y_m, irm.anchor_m[node, 0] - odometry.pose.x_m)
+            yaw = math.atan2(
+                irm.anchor_m[node, 1] - odometry.pose.y_m, irm.anchor_m[node, 0] - odometry.pose.x_m
+            )
             turn = abs(math.remainder(yaw - odometry.pose.yaw_rad, 2.0 * math.pi)) / math.pi
             score = float(cost[r, c]) + (0.6 * turn if cost[r, c] > 0.2 else 0.0)
             if best is None or score < best[0]:

@@ -41,9 +41,7 @@ def project(points: NDArray[np.float64], x_m: float, y_m: float, low: int, high:
     return low + best, float(distance[best])
 
 
-def smooth(
-    points: NDArray[np.float64], fixed: int, ground: Ground, config: Config
-) -> NDArray[np.float64]:
+def smooth(points: NDArray[np.float64], fixed: int, ground: Ground, config: Config) -> NDArray[np.float64]:
     """The line resampled to STEP_M, corners rounded and pushed off walls; the first `fixed` points stay as they are.
 
     points: (k, 2) m. No step makes the clearance worse below the comfort clearance.
@@ -122,7 +120,14 @@ def _may_skip(
         if offset > max_offset_m or along < -1e-9 or along > length * length + 1e-9:
             return False
         leg = segment_min_clearance(
-            clearance_m, resolution_m, ix0, iy0, points[m, 0], points[m, 1], points[m + 1, 0], points[m + 1, 1]
+            clearance_m,
+            resolution_m,
+            ix0,
+            iy0,
+            points[m, 0],
+            points[m, 1],
+            points[m + 1, 0],
+            points[m + 1, 1],
         )
         needed = min(needed, leg - 0.004)
     return segment_min_clearance(clearance_m, resolution_m, ix0, iy0, x0, y0, x1, y1) >= needed
@@ -163,8 +168,12 @@ def relax(
             nx = x + 0.35 * (line[i - 1, 0] + line[i + 1, 0] - 2.0 * x)
             ny = y + 0.35 * (line[i - 1, 1] + line[i + 1, 1] - 2.0 * y)
             if before < comfort_m:
-                gx = clearance_at(clearance_m, h, ix0, iy0, x + h, y) - clearance_at(clearance_m, h, ix0, iy0, x - h, y)
-                gy = clearance_at(clearance_m, h, ix0, iy0, x, y + h) - clearance_at(clearance_m, h, ix0, iy0, x, y - h)
+                gx = clearance_at(clearance_m, h, ix0, iy0, x + h, y) - clearance_at(
+                    clearance_m, h, ix0, iy0, x - h, y
+                )
+                gy = clearance_at(clearance_m, h, ix0, iy0, x, y + h) - clearance_at(
+                    clearance_m, h, ix0, iy0, x, y - h
+                )
                 norm = math.hypot(gx, gy)
                 if norm > 0.2 * h:
                     push = 0.1 * (comfort_m - before)
@@ -221,9 +230,7 @@ def speeds(
     limit = np.full(k, config.max_speed_mps * share)
     limit = np.minimum(limit, _curve_limit(line, config))
     g = ground.spec
-    clear = np.array(
-        [clearance_at(ground.clearance_m, g.resolution_m, g.ix0, g.iy0, x, y) for x, y in line]
-    )
+    clear = np.array([clearance_at(ground.clearance_m, g.resolution_m, g.ix0, g.iy0, x, y) for x, y in line])
     span = max(config.free_clearance_m - config.tight_clearance_m, 1e-3)
     roomy = np.clip((clear - config.tight_clearance_m) / span, 0.0, 1.0)
     tight = config.min_speed_mps + (config.max_speed_mps * share - config.min_speed_mps) * roomy

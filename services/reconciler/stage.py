@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-
 import numpy as np
 from numpy.typing import NDArray
 
 from planning.grid import GridSpec
-from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
+from schemas.base import Message
+from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp, Topic
 from schemas.policy import EpisodeRequest, LocalPhase, LocalPolicy, Plan
 from schemas.sensing import FollowerState, Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
@@ -49,7 +49,9 @@ _SOON_M = 2.5
 
 def spec(config: Config) -> StageSpec:
     """How to run the stage: at 10 Hz, and at once on risk maps and answers."""
-    return StageSpec("reconciler", SECOND_NS // 10, (RISK_MAP.name, LOCAL_POLICY.name), latency_ns=SECOND_NS // 100)
+    return StageSpec(
+        "reconciler", SECOND_NS // 10, (RISK_MAP.name, LOCAL_POLICY.name), latency_ns=SECOND_NS // 100
+    )
 
 
 def create(config: Config, setup: StageSetup) -> Stage:
@@ -92,7 +94,9 @@ class ReconcilerStage:
             return []
         g = risk.message.grid
         ground = Ground(
-            GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height), risk.message.state, risk.message.clearance_m
+            GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height),
+            risk.message.state,
+            risk.message.clearance_m,
         )
         found: Outputs = []
         follower = inputs.current(FOLLOWER)
@@ -148,11 +152,19 @@ class ReconcilerStage:
             return
         points = self._committed.points
         self._at, off = project(
-            points, odometry.pose.x_m, odometry.pose.y_m, max(self._at - 3, 0), min(self._at + 25, len(points) - 1)
+            points,
+            odometry.pose.x_m,
+            odometry.pose.y_m,
+            max(self._at - 3, 0),
+            min(self._at + 25, len(points) - 1),
         )
         if off > self._config.off_path_m:
             self._drop("off the path")
-        trouble = follower is not None and follower.plan_id == self._plan_id and (follower.blocked or follower.stuck)
+        trouble = (
+            follower is not None
+            and follower.plan_id == self._plan_id
+            and (follower.blocked or follower.stuck)
+        )
         if not trouble:
             self._trouble_ns = -1
         elif self._trouble_ns < 0:
@@ -199,9 +211,15 @@ class ReconcilerStage:
         if self._committed is None:
             return None
         c, committed = self._config, self._committed
-        reachable = [i for i in usable_nodes(committed, irm, self._at) if committed.node_point[i] <= self._end]
+        reachable = [
+            i for i in usable_nodes(committed, irm, self._at) if committed.node_point[i] <= self._end
+        ]
         v = odometry.speed_mps
-        least_m = abs(v) * max(c.planning_latency_s, 1.3 * self._latency_s) + v * v / (2.0 * c.max_acceleration_mps2) + 0.2
+        least_m = (
+            abs(v) * max(c.planning_latency_s, 1.3 * self._latency_s)
+            + v * v / (2.0 * c.max_acceleration_mps2)
+            + 0.2
+        )
         ahead = [int(committed.node_point[i] - self._at) * STEP_M for i in reachable]
         first = next((j for j, m in enumerate(ahead) if m >= least_m), None)
         if first is None:
@@ -234,7 +252,9 @@ class ReconcilerStage:
             keeps_old=True,
             junction_point=point,
         )
-        return opened, self._request(now, irm, node, self._heading(committed, reachable[kept]), odometry, covered, opened)
+        return opened, self._request(
+            now, irm, node, self._heading(committed, reachable[kept]), odometry, covered, opened
+        )
 
     def _from_here(
         self, now: Stamp, irm: LocalIrm, odometry: Odometry, ground: Ground
@@ -298,12 +318,19 @@ class ReconcilerStage:
     # --- answers ------------------------------------------------------------------------------------------------
 
     def _install(self, now: Stamp, policy: LocalPolicy, odometry: Odometry, ground: Ground) -> None:
-        """Concatenate the kept prefix and the new policy (Eq. 15); answers to other episodes are dropped."""
+        """Concatenate the kept prefix and the new policy (Eq. 19); answers to other episodes are dropped."""
         opened = self._opened
         self._asked_ns = -1
         if opened is None or policy.episode != opened.number:
             return
         self._opened = None
+        latency_s = (now - opened.opened_ns) / SECOND_NS
+        self._latency_s = max(
+            latency_s, 0.8 * self._latency_s + 0.2 * latency_s
+        )  # slower at once, faster by degrees
+        if opened.keeps_old and self._at > opened.junction_point:
+            self._why = "the answer came after its junction"
+            return
         if policy.phase == LocalPhase.NONE or len(policy.path_lattice) == 0:
             self._why = policy.reason
             return
@@ -323,7 +350,9 @@ class ReconcilerStage:
         node_point = list(opened.kept_point)
         at = int(node_point[-1]) if node_point else 0
         for x, y in anchors:
-            at, _ = project(points, float(x), float(y), min(at, len(points) - 1), min(at + 30, len(points) - 1))
+            at, _ = project(
+                points, float(x), float(y), min(at, len(points) - 1), min(at + 30, len(points) - 1)
+            )
             node_point.append(at)
         self._committed = Committed(points, lattice, np.array(node_point, np.int64), policy.target)
         self._at, _ = project(points, odometry.pose.x_m, odometry.pose.y_m, 0, min(40, len(points) - 1))
@@ -397,8 +426,6 @@ class ReconcilerStage:
         self._value_ratio = float(state["value_ratio"])
 
 
-def _age_s(inputs: Inputs, topic) -> float | None:  # type: ignore[no-untyped-def]
+def _age_s(inputs: Inputs, topic: Topic[Message]) -> float | None:
     received = inputs.latest(topic)
     return None if received is None else received.age_ns / SECOND_NS
-
-

@@ -16,7 +16,7 @@ from planning.reward import travel_discount
 class TauTerms(NamedTuple):
     """The terms of the choice for each candidate: keeping i steps of the old policy, i = 0..k.
 
-    kept: discounted expected reward of the kept steps, re-evaluated under the current belief (Eq. 13; half-open: step
+    kept: discounted expected reward of the kept steps, re-evaluated under the current belief (Eq. 17; half-open: step
     i belongs to the new policy). replanned: discounted value of replanning from the junction. mismatch: R at the
     junction, 0 to 1. All (k + 1,). possible: how many steps can be made at all under the current belief.
     """

@@ -170,7 +170,9 @@ def _clear_passed(
         while travelled < length and 0 <= row < height and 0 <= column < width:
             off_x = column + 0.5 + hit_x[row, column] / resolution_m - x0
             off_y = row + 0.5 + hit_y[row, column] / resolution_m - y0
-            pierced = hit_weight[row, column] == 0.0 or abs(off_x * dy - off_y * dx) * resolution_m <= _PIERCED_M
+            pierced = (
+                hit_weight[row, column] == 0.0 or abs(off_x * dy - off_y * dx) * resolution_m <= _PIERCED_M
+            )
             if passed[row, column] == 0 and pierced:
                 passed[row, column] = 2
                 log_odds[row, column] = max(log_odds[row, column] - evidence[1], -evidence[2])

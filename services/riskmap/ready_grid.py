@@ -24,7 +24,11 @@ def apply_ready_grid(grid: ReadyGrid, window: OccupancyWindow, clamp_log_odds: f
     p = np.clip(percent / 100.0, 1e-6, 1.0 - 1e-6)
     evidence = np.clip(np.log(p / (1.0 - p)), -clamp_log_odds, clamp_log_odds)
     window.log_odds[known] = evidence[known]
-    for hits in (window.hit_weight, window.hit_x, window.hit_y):  # a grid says nothing about where in the cell
+    for hits in (
+        window.hit_weight,
+        window.hit_x,
+        window.hit_y,
+    ):  # a grid says nothing about where in the cell
         hits[known] = 0.0
 
 

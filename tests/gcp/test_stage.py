@@ -174,6 +174,29 @@ def test_switches_for_a_much_better_one_and_says_so() -> None:
     assert not bench.step().switched
 
 
+@pytest.mark.parametrize(
+    ("absolute", "relative", "switches"),
+    [(3.0, 0.5, True), (5.0, 0.5, False), (3.0, 3.0, False), (5.0, 3.0, False)],
+)
+def test_a_switch_takes_both_margins(absolute: float, relative: float, switches: bool) -> None:
+    """Q of the target is about 1.6, and of the other 5.6: better by 4, which is 2.5 times the target's |Q|."""
+    bench = Bench(switch_margin=absolute, switch_margin_relative=relative)
+    bench.step((GLOBAL_IRM, fork()))
+    policy = bench.step((GLOBAL_IRM, fork(2, gains=(14.4, 5.0))))
+    best, kept = (next(o.q for o in policy.alternatives if o.frontier == f) for f in (10, 11))
+    assert best - kept == pytest.approx(4.0, abs=0.5) and 2.2 < (best - kept) / kept < 2.8
+    assert policy.switched == switches
+    assert policy.target == (10 if switches else 11)
+
+
+def test_by_default_a_target_is_kept_for_one_that_is_better_by_ten_nats() -> None:
+    bench = Bench()
+    bench.step((GLOBAL_IRM, fork()))
+    policy = bench.step((GLOBAL_IRM, fork(2, gains=(28.0, 5.0))))
+    assert 9.0 < policy.alternatives[0].q - policy.target_q < 12.0
+    assert policy.target == 11
+
+
 def test_a_target_that_is_gone_is_replaced_without_a_switch() -> None:
     bench = Bench()
     bench.step((GLOBAL_IRM, fork()))
@@ -190,7 +213,7 @@ def test_a_frontier_with_a_new_id_at_the_place_is_the_same_target() -> None:
     nodes: dict[int, Node] = {
         1: (CRUMB, 0.0, 0.0, 0.0),
         12: (FRONTIER, 0.5, 31.0, 5.0),
-        13: (FRONTIER, 5.0, 0.0, 1.2),
+        13: (FRONTIER, 5.0, 0.0, 2.5),
     }
     policy = bench.step((GLOBAL_IRM, graph(2, nodes, {(1, 12): (30.0, 0.0), (1, 13): (5.0, 0.0)})))
     assert policy.alternatives[0].frontier == 13

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from planning.reward import RewardWeights, leftover_entropy
 from schemas.base import Pose
 from schemas.codec import Envelope, encode
 from schemas.contract import SECOND_NS, StageSetup
@@ -15,7 +16,6 @@ from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
 from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
 from schemas.world import LocalIrm
-from planning.reward import RewardWeights, leftover_entropy
 from services.lcp.stage import Config, LcpStage, create, spec
 from tests.lcp.local_irms import IX0, IY0, anchor_of, global_policy, local_irm, mission, request
 from tests.planning.coverage_lattices import STEPS, Edge, Reference, random_lattice

@@ -1,0 +1,252 @@
+"""Frontiers at the edge of the unseen, and which frontiers are kept, waited for, and given up."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from planning.coverage import LOG_2
+from planning.grid import FREE, LETHAL, UNKNOWN
+from schemas.snapshot import pack_snapshot, unpack_snapshot
+from services.irm.config import Config
+from services.irm.frontiers import Frontier, FrontierManager, beside, find_frontiers, solid
+from services.irm.window import Window
+from tests.irm.worlds import Belief, Flat, room
+
+SECOND = 10**9
+RES = 0.2
+ROBOT = (-6.0, 2.5)
+
+
+class Scene:
+    """A corridor of 16 x 3 m that the robot has covered up to some x, and its frontiers."""
+
+    def __init__(self, covered_to_m: float = 99.0, **changes: float) -> None:
+        self.config = Config.model_validate(changes)
+        self.belief, self.flat = Belief.new(self.config, RES), room(-8.0, 1.0, 8.0, 4.0, RES)
+        self.manager, self.rounds, self.next_id = FrontierManager(self.config), 0, 1
+        x, _ = np.meshgrid(self.flat.spec.centres_x(), self.flat.spec.centres_y())
+        self.belief.cover(self.flat.spec, x < covered_to_m)
+
+    def window(self) -> Window:
+        return self.belief.window(self.flat.risk_map(), *ROBOT)
+
+    def find(self) -> list[tuple[float, float, float]]:
+        return find_frontiers(self.window(), self.config)
+
+    def round(self, robot: tuple[float, float] = ROBOT) -> dict[int, Frontier]:
+        """One update, a second after the last one."""
+        self.next_id = self.manager.update(self.window(), robot, self.rounds * SECOND, 1.0, self.next_id)
+        self.rounds += 1
+        return self.manager.frontiers
+
+    def only(self) -> Frontier:
+        (frontier,) = self.manager.frontiers.values()
+        return frontier
+
+    def pursue(self, distance_m: float) -> None:
+        """The global planner's target is the only frontier."""
+        self.manager.pursue(self.only().node_id, distance_m, self.rounds * SECOND, 1.0)
+
+    def forget(self, x_low: float, x_high: float) -> None:
+        """The risk map knows nothing any more between two x."""
+        self.flat.fill(x_low, 0.9, x_high, 4.1, UNKNOWN)
+
+
+# --- the edge of the unseen ---------------------------------------------------------------------------------------
+
+
+def test_beside_is_a_side_in_common() -> None:
+    mask = np.zeros((5, 6), np.bool_)
+    mask[2, 3] = mask[0, 0] = True
+    expected = {(1, 3), (3, 3), (2, 2), (2, 4), (0, 1), (1, 0)}
+    assert set(map(tuple, np.argwhere(beside(mask)).tolist())) == expected
+
+
+def test_solid_leaves_out_single_cells_and_thin_lines() -> None:
+    unseen = np.zeros((12, 12), np.bool_)
+    unseen[1, 1] = True
+    unseen[4, :] = True
+    assert not solid(unseen).any()
+    unseen[7:10, 7:10] = True
+    assert set(map(tuple, np.argwhere(solid(unseen)).tolist())) == {
+        (8, 8), (7, 8), (9, 8), (8, 7), (8, 9),
+    }  # fmt: skip
+    assert solid(np.ones((3, 3), np.bool_)).all(), "beyond the window's edge it goes on"
+
+
+def test_covered_ground_at_the_edge_of_the_unseen_is_a_frontier_and_beside_a_wall_is_none() -> None:
+    scene = Scene()
+    assert scene.find() == []
+    scene = Scene()
+    scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)  # the corridor's end was not seen: no wall
+    found = scene.find()
+    assert len(found) == 1
+    x, y, gain = found[0]
+    assert 3.0 < x < 4.0 and 1.0 < y < 4.0
+    cells = 3.0 / RES
+    assert gain == pytest.approx(min(cells * 0.5 * RES * LOG_2, 3.0), rel=0.1)
+
+
+@pytest.mark.parametrize(("depth_m", "most", "gain"), [(20.0, 2.0, 2.0), (20.0, 1.0, 1.0), (0.0, 2.0, None)])
+def test_the_unseen_counts_up_to_a_limit_and_not_at_all_when_nothing_is_expected_there(
+    depth_m: float, most: float, gain: float | None
+) -> None:
+    scene = Scene(unknown_depth_m=depth_m, unknown_max_gain=most)
+    scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
+    assert [g for _, _, g in scene.find()] == ([] if gain is None else [pytest.approx(gain)])
+
+
+def test_gaps_between_far_rays_are_no_frontier() -> None:
+    scene = Scene()
+    for row in range(0, scene.flat.state.shape[0], 2):
+        line = scene.flat.state[row]
+        line[line == FREE] = np.where(np.arange((line == FREE).sum()) > 40, UNKNOWN, FREE)
+    assert (scene.flat.state == UNKNOWN).sum() > 100
+    assert scene.find() == []
+
+
+def test_ground_that_was_known_and_forgotten_is_no_edge_of_the_unseen() -> None:
+    scene = Scene()
+    assert scene.find() == []
+    scene.forget(2.0, 9.0)
+    assert scene.find() == []
+
+
+# --- which frontiers are kept -------------------------------------------------------------------------------------
+
+
+def test_a_frontier_whose_place_the_risk_map_has_forgotten_is_kept_as_it_was() -> None:
+    scene = Scene(covered_to_m=2.0)
+    scene.round()
+    before = (scene.only().node_id, scene.only().x_m, scene.only().y_m)
+    scene.forget(-2.0, 9.0)
+    for _ in range(3 * scene.config.missed_rounds):
+        scene.round()
+    assert (scene.only().node_id, scene.only().x_m, scene.only().y_m) == before
+    assert scene.manager.given_up == []
+
+
+def test_a_frontier_that_is_cut_off_is_waited_for_and_keeps_its_name() -> None:
+    scene = Scene(covered_to_m=2.0, missed_rounds=5)
+    scene.round()
+    name = scene.only().node_id
+    scene.flat.fill(-2.0, 0.9, -1.6, 4.1, LETHAL)  # someone stands in the way
+    for missed in range(1, 6):
+        scene.round()
+        assert (scene.only().node_id, scene.only().missed) == (name, missed)
+    scene.flat.fill(-2.0, 1.0, -1.6, 4.0, FREE)
+    scene.round()
+    assert (scene.only().node_id, scene.only().missed) == (name, 0)
+    assert scene.manager.given_up == []
+
+
+def test_a_frontier_that_stays_cut_off_is_given_up_with_its_reason() -> None:
+    scene = Scene(covered_to_m=2.0, missed_rounds=5)
+    scene.round()
+    scene.flat.fill(-2.0, 0.9, -1.6, 4.1, LETHAL)
+    for _ in range(5):
+        assert len(scene.round()) == 1
+    assert scene.round() == {}
+    assert ["cut off" in g.reason for g in scene.manager.given_up] == [True]
+
+
+def test_a_frontier_of_which_a_sliver_is_left_within_reach_goes_without_a_word() -> None:
+    """Nothing is given up there: what is left is too thin to be ground to cover."""
+    scene = Scene(covered_to_m=2.0, missed_rounds=5)
+    scene.round()
+    row, column = scene.flat.spec.cell_of(scene.only().x_m, scene.only().y_m)
+    sliver = np.ones(scene.flat.spec.shape, np.bool_)
+    sliver[row, column] = False
+    scene.belief.cover(scene.flat.spec, sliver)
+    for _ in range(5):
+        assert len(scene.round()) == 1
+    assert scene.round() == {}
+    assert scene.manager.given_up == []
+
+
+def test_time_beside_a_frontier_begins_anew_when_its_place_moves() -> None:
+    """A robot that moves on with the border is not standing beside it in vain, though no gain shrinks."""
+    times = {}
+    for step_m in (0.0, 0.8):
+        scene = Scene(covered_to_m=-4.0, give_up_s=3.0)
+        x, _ = np.meshgrid(scene.flat.spec.centres_x(), scene.flat.spec.centres_y())
+        scene.round()
+        for k in range(3):
+            cells: NDArray[np.bool_] = x < -4.0 + step_m * k
+            scene.belief.cover(scene.flat.spec, cells)
+            scene.round()
+            scene.round((scene.only().x_m, scene.only().y_m))
+        times[step_m] = scene.only().beside_s
+    assert times[0.0] == 3.0
+    assert times[0.8] <= 1.0
+
+
+# --- targets ------------------------------------------------------------------------------------------------------
+
+
+def test_a_target_that_comes_no_nearer_is_given_up() -> None:
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0)
+    scene.round()
+    place = (scene.only().x_m, scene.only().y_m)
+    scene.pursue(10.0)
+    for k in range(5):
+        scene.pursue(9.6 + 0.1 * k)  # up and down, but never half a metre nearer
+        scene.round()
+    assert len(scene.manager.frontiers) == 1
+    scene.pursue(10.0)
+    assert scene.manager.frontiers == {}
+    (given_up,) = scene.manager.given_up
+    assert (given_up.x_m, given_up.y_m) == place
+    assert "no nearer" in given_up.reason
+    assert given_up.until_ns == scene.rounds * SECOND + int(scene.config.retry_after_s * 1e9)
+    assert all(math.dist(place, (f.x_m, f.y_m)) > 1.0 for f in scene.round().values())
+
+
+def test_a_target_that_comes_nearer_is_not_given_up() -> None:
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0)
+    scene.round()
+    for k in range(30):
+        scene.pursue(100.0 - 0.2 * k)  # half a metre every third second
+        scene.round()
+    assert len(scene.manager.frontiers) == 1 and scene.manager.given_up == []
+
+
+def test_a_target_that_shrinks_is_not_pursued_in_vain() -> None:
+    """Seen from afar it is covered piece by piece: the robot need not come nearer."""
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0, unknown_depth_m=0.0)
+    x, y = np.meshgrid(scene.flat.spec.centres_x(), scene.flat.spec.centres_y())
+    scene.round()
+    gain = scene.only().gain
+    for k in range(8):
+        scene.belief.cover(scene.flat.spec, x > 7.5 - 0.6 * k)
+        for _ in range(3):
+            scene.pursue(10.0)
+            scene.round()
+    assert scene.only().gain < 0.5 * gain
+    assert scene.manager.given_up == []
+
+
+def test_what_is_no_frontier_is_not_pursued() -> None:
+    scene = Scene(covered_to_m=2.0, pursue_s=1.0)
+    scene.round()
+    for _ in range(9):
+        scene.manager.pursue(12345, 10.0, 0, 1.0)
+    assert len(scene.manager.frontiers) == 1
+
+
+def test_a_snapshot_keeps_how_long_a_target_was_pursued_and_a_frontier_missed() -> None:
+    scene = Scene(covered_to_m=2.0, missed_rounds=4, pursue_s=8.0)
+    scene.round()
+    scene.flat.fill(-2.0, 0.9, -1.6, 4.1, LETHAL)
+    scene.pursue(10.0)
+    for _ in range(3):
+        scene.pursue(10.0)
+        scene.round()
+    other = FrontierManager(scene.config)
+    other.set_state(unpack_snapshot(pack_snapshot(scene.manager.state())))
+    assert other.frontiers == scene.manager.frontiers
+    assert (scene.only().missed, scene.only().pursued_s, scene.only().nearest_m) == (3, 3.0, 10.0)
