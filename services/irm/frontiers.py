@@ -58,11 +58,19 @@ class FrontierManager:
     given_up: list[GivenUp] = field(default_factory=list)
 
     def update(
-        self, window: Window, robot: tuple[float, float], now_ns: int, elapsed_s: float, next_id: int
+        self,
+        window: Window,
+        robot: tuple[float, float],
+        now_ns: int,
+        elapsed_s: float,
+        next_id: int,
+        ground_m2: float = 0.0,
     ) -> int:
-        """Look at the window again. elapsed_s: since the last call. Returns the next free node id."""
+        """Look at the window again. elapsed_s: since the last call; ground_m2: known so far. Returns the next free id."""
         self.given_up = [g for g in self.given_up if g.until_ns > now_ns]
-        found = [f for f in find_frontiers(window, self.config) if not self._is_given_up(f[0], f[1])]
+        least = least_gain(self.config, ground_m2)
+        found = [f for f in find_frontiers(window, self.config, least) if not self._is_given_up(f[0], f[1])]
+        self.frontiers = {k: f for k, f in self.frontiers.items() if f.gain >= least}
         inside = [f for f in self.frontiers.values() if _in_window(window, f)]
         for frontier in inside:
             frontier.seen = False
@@ -168,8 +176,16 @@ def _in_window(window: Window, frontier: Frontier) -> bool:
     return window.spec.contains(row, column)
 
 
-def find_frontiers(window: Window, config: Config) -> list[tuple[float, float, float]]:
-    """The frontiers of a window: (x, y, expected information gain), in a fixed order.
+def least_gain(config: Config, ground_m2: float) -> float:
+    """The gain from which a border is a frontier: a share of the ground known, within the two bounds, nats."""
+    share = config.frontier_min_share * ground_m2 / config.spacing_m**2 * LOG_2
+    return max(config.frontier_min_gain, min(share, config.frontier_enough_gain))
+
+
+def find_frontiers(
+    window: Window, config: Config, least: float | None = None
+) -> list[tuple[float, float, float]]:
+    """The frontiers of a window with at least this gain: (x, y, expected information gain), in a fixed order.
 
     The uncovered ground is split into connected pieces; the border of a piece with covered ground is cut into blocks
     snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Ground that
@@ -198,7 +214,7 @@ def find_frontiers(window: Window, config: Config) -> list[tuple[float, float, f
     piece_of = np.zeros(blocks, np.int64)
     inside = block >= 0
     piece_of[block[inside]] = labels[inside]
-    return _select(gain, places, piece_of, window, config)
+    return _select(gain, places, piece_of, window, config.frontier_min_gain if least is None else least)
 
 
 def solid(unseen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -221,7 +237,7 @@ def _select(
     places: NDArray[np.int64],
     piece_of: NDArray[np.int64],
     window: Window,
-    config: Config,
+    least: float,
 ) -> list[tuple[float, float, float]]:
     """Blocks with enough gain; of a piece of many small blocks that is worth it as a whole, its best block."""
     found = []
@@ -233,8 +249,8 @@ def _select(
             best[piece] = index
     for index in range(len(gain)):
         piece = int(piece_of[index])
-        alone = gain[index] >= config.frontier_min_gain
-        together = best[piece] == index and total[piece] >= config.frontier_min_gain
+        alone = gain[index] >= least
+        together = best[piece] == index and total[piece] >= least
         if places[index, 0] >= 0 and (alone or together):
             x, y = window.spec.centre_of(int(places[index, 0]), int(places[index, 1]))
             found.append((x, y, float(gain[index] if alone else total[piece])))

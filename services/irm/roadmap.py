@@ -43,9 +43,11 @@ class Roadmap:
     def __post_init__(self) -> None:
         self.manager = FrontierManager(self.config)
 
-    def update(self, window: Window, x_m: float, y_m: float, now_ns: int, elapsed_s: float) -> None:
-        """One round: new breadcrumb, frontiers, edges near the robot."""
-        self.next_id = self.manager.update(window, (x_m, y_m), now_ns, elapsed_s, self.next_id)
+    def update(
+        self, window: Window, x_m: float, y_m: float, now_ns: int, elapsed_s: float, ground_m2: float = 0.0
+    ) -> None:
+        """One round: new breadcrumb, frontiers, edges near the robot. ground_m2: reachable ground known so far."""
+        self.next_id = self.manager.update(window, (x_m, y_m), now_ns, elapsed_s, self.next_id, ground_m2)
         search = _Search(window)
         search.run(window.robot_cell, 3.0 * self.config.max_edge_m)
         self._place_robot(x_m, y_m)

@@ -158,7 +158,7 @@ class IrmStage:
         place = planar(odometry.map_to_odom).compose(planar(odometry.pose))
         if policy is not None:
             self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, elapsed)
-        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed)
+        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, self._areas()[0])
         first = self._roadmap.version == 0
         message = self._roadmap.message(odometry.pose, odometry.map_to_odom, now, whole or first)
         s = window.spec

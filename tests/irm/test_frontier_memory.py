@@ -14,7 +14,7 @@ from schemas.snapshot import pack_snapshot, unpack_snapshot
 from services.irm.config import Config
 from services.irm.frontiers import Frontier, FrontierManager, beside, find_frontiers, solid
 from services.irm.window import Window
-from tests.irm.worlds import Belief, Flat, room
+from tests.irm.worlds import Belief, room
 
 SECOND = 10**9
 RES = 0.2
@@ -217,16 +217,16 @@ def test_a_target_that_comes_nearer_is_not_given_up() -> None:
 
 def test_a_target_that_shrinks_is_not_pursued_in_vain() -> None:
     """Seen from afar it is covered piece by piece: the robot need not come nearer."""
-    scene = Scene(covered_to_m=2.0, pursue_s=5.0, unknown_depth_m=0.0)
-    x, y = np.meshgrid(scene.flat.spec.centres_x(), scene.flat.spec.centres_y())
+    scene = Scene(covered_to_m=2.0, pursue_s=8.0, frontier_block_m=50.0, frontier_same_m=10.0)
+    x, _ = np.meshgrid(scene.flat.spec.centres_x(), scene.flat.spec.centres_y())
     scene.round()
     gain = scene.only().gain
-    for k in range(8):
-        scene.belief.cover(scene.flat.spec, x > 7.5 - 0.6 * k)
+    for k in range(7):
+        scene.belief.cover(scene.flat.spec, x > 7.5 - 0.7 * k)
         for _ in range(3):
             scene.pursue(10.0)
             scene.round()
-    assert scene.only().gain < 0.5 * gain
+    assert scene.only().gain < 0.5 * gain and scene.only().nearest_m == 10.0
     assert scene.manager.given_up == []
 
 

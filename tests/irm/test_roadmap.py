@@ -286,6 +286,28 @@ def test_hazard_on_the_way_becomes_the_risk_of_the_edge() -> None:
     assert edge["risk"] == pytest.approx(1 - math.exp(-0.1 * edge["distance"]), abs=0.06)
 
 
+def test_a_frontier_that_no_edge_leads_to_is_given_up_after_a_while_and_not_before() -> None:
+    """Its ground connects, but every way to it is too risky for an edge; when it calms down in time it stays."""
+    for rough_rounds, stays in ((6, True), (7, False)):
+        drive = Drive(room(0.0, 0.0, 9.0, 3.0, RES), config=CONFIG.model_copy(update={"missed_rounds": 2}))
+        drive.to(1.5, 1.5)
+        (frontier,) = drive.roadmap.manager.frontiers
+        risk = drive.flat.risk_map(1.5, 1.5, 12.0)
+        deep = risk.model_copy(update={"hazard_cvar": risk.hazard_cvar + np.float32(2.0)})
+        drive.roadmap.graph.remove_edges_from(list(drive.roadmap.graph.edges(frontier)))
+        for _ in range(rough_rounds):
+            drive.roadmap.update(drive.belief.window(deep, 1.5, 1.5), 1.5, 1.5, drive.tick * SECOND, 1.0)
+            drive.tick += 1
+        manager = drive.roadmap.manager
+        assert (frontier in manager.frontiers) is stays
+        assert (frontier in drive.roadmap.graph) is stays
+        assert [g.reason for g in manager.given_up] == ([] if stays else ["no way over the graph"])
+        if stays:
+            drive.to(1.5, 1.5)
+            assert drive.roadmap.graph.degree(frontier) > 0
+            assert manager.frontiers[frontier].isolated == 0
+
+
 def test_a_snapshot_goes_on_alike_and_its_next_message_is_whole() -> None:
     drive = Drive(ring())
     for x, y in lap()[:25]:

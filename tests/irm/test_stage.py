@@ -21,14 +21,16 @@ from schemas.topics import (
     FOLLOWER,
     GCP_GRAPH_REQUEST,
     GLOBAL_IRM,
+    GLOBAL_POLICY,
     LOCAL_IRM,
     ODOMETRY,
     POSE_GRAPH,
     RISK_MAP,
 )
-from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest, LocalIrm
+from schemas.world import FRONTIER, CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest, LocalIrm
 from services.irm.stage import Config, IrmStage, create, spec
 from tests.irm.worlds import Flat, pose_graph, room, scan_at
+from tests.lcp.local_irms import global_policy
 from tests.riskmap.helpers import inputs, merged, odometry
 
 M = TypeVar("M", bound=Message)
@@ -253,3 +255,29 @@ def test_a_gap_in_the_inputs_is_not_time_beside_a_frontier() -> None:
         summary = one(stage.step(now_s * SECOND_NS, feeds(flat, 0.0, 0.0)), COVERAGE)
         assert isinstance(summary, CoverageSummary)
         assert summary.frontiers == 1 and summary.unreachable_reason == []
+
+
+@pytest.mark.parametrize(("offset", "given_up"), [(0, True), (1000, False)])
+def test_the_frontier_that_the_global_planner_pursues_in_vain_is_given_up(
+    offset: int, given_up: bool
+) -> None:
+    """The policy's target and distance count, by the time between rounds; a target that is no frontier is ignored."""
+    config = CONFIG.model_copy(update={"pursue_s": 5.0, "give_up_s": 600.0})
+    stage, flat = IrmStage(config), room(-4.0, -4.0, 4.0, 4.0, 0.2)
+    names, reasons = [], []
+    for k in range(8):
+        found = feeds(flat, 0.5, 0.5)
+        if names:
+            policy = global_policy([(0.5, 0.5), (3.0, 3.0)]).model_copy(
+                update={"target": names[0] + offset, "target_distance_m": 4.0}
+            )
+            found = merged(found, inputs((GLOBAL_POLICY, policy)))
+        outputs = stage.step(k * SECOND_NS, found)
+        graph, summary = one(outputs, GLOBAL_IRM), one(outputs, COVERAGE)
+        assert isinstance(graph, GlobalIrm) and isinstance(summary, CoverageSummary)
+        if not names:
+            names = graph.node_id[graph.node_kind == FRONTIER].tolist()
+        reasons.append(summary.unreachable_reason)
+    assert all(r == [] for r in reasons[:7]), "one round for the distance, then five seconds"
+    assert (len(reasons[7]) == 1) == given_up
+    assert all("no nearer" in r for r in reasons[7])

@@ -79,8 +79,10 @@ def test_what_was_passable_stays_so_while_clearance_wavers() -> None:
     flat = two_rooms(0.8)
     risk = flat.risk_map()
     tight = risk.clearance_m[flat.spec.cell_of(0.1, 0.0)]
-    for margin, waver, passes in ((0.0, 0.02, True), (0.0, 0.04, False)):
-        belief = Belief.new(Config(clearance_margin_m=margin), RES)
+    hysteresis = Config().clearance_hysteresis_m
+    assert hysteresis > 0.0
+    for share, passes in ((0.6, True), (1.4, False)):
+        belief, waver = Belief.new(Config(), RES), share * hysteresis
         exact = risk.model_copy(update={"footprint_radius_m": float(tight) - 1e-4})
         assert belief.window(exact, -2.5, 0.0).free_space[flat.spec.cell_of(2.0, 0.0)]
         narrower = exact.model_copy(
@@ -111,6 +113,21 @@ def test_ground_is_remembered_where_the_map_has_forgotten_it_and_goes_when_it_tu
     flat.fill(1.0, -3.0, 3.0, 3.0, LETHAL)
     solid = belief.window(flat.risk_map(), 0.0, 0.0)
     assert not solid.ground[flat.spec.cell_of(2.0, 0.0)]
+
+
+def test_unseen_is_what_no_risk_map_ever_knew_wherever_the_robot_is_by_now() -> None:
+    flat = two_rooms(0.4)
+    flat.fill(2.0, -1.0, 3.0, 1.0, UNKNOWN)
+    belief, hole, far = Belief.new(Config(), RES), flat.spec.cell_of(2.5, 0.0), flat.spec.cell_of(4.0, 0.0)
+    first = belief.window(flat.risk_map(), -2.5, 0.0)
+    assert np.array_equal(first.unseen, flat.state == UNKNOWN)
+    assert first.unseen[hole] and not first.ground[far], "known and out of reach is not unseen"
+    known = flat.state != UNKNOWN
+    flat.fill(-9.0, -9.0, 9.0, 9.0, UNKNOWN)
+    forgotten = belief.window(flat.risk_map(), -2.5, 0.0)
+    assert np.array_equal(forgotten.unseen, ~known), "what is forgotten was seen"
+    flat.fill(2.0, -1.0, 3.0, 1.0, FREE)
+    assert not belief.window(flat.risk_map(), -2.5, 0.0).unseen[hole]
 
 
 @settings(max_examples=15)

@@ -322,6 +322,19 @@ def test_a_bent_edge_is_driven_along_its_inner_points_in_both_directions(backwar
     assert found.path_node_point.tolist() == [0, 1, 4, 5]
 
 
+def test_an_answer_tells_what_its_rollouts_alone_are_worth() -> None:
+    """So that the reconciler can weigh rollouts like plans; a guide has no rollouts."""
+    lattice = random_lattice(6, SIZE, 2, risky_share=0.5)
+    found = answer(feed_of(lattice), request(lattice, 40, simulations=2048))
+    assert found is not None and found.phase is LocalPhase.COVER
+    assert 0.3 * found.root_value < found.rollout_value <= 1.05 * found.root_value
+    feed = feed_of(corridor({}))
+    feed.put(GLOBAL_POLICY, global_policy([at(2), at(20)]), 0)
+    guided = answer(feed, request(lattice, 4 * SIZE + 2))
+    assert guided is not None and guided.phase is LocalPhase.GUIDE
+    assert guided.rollout_value == 0.0
+
+
 def test_the_policy_tree_is_a_tree() -> None:
     lattice = random_lattice(6, SIZE, 2, risky_share=0.5)
     found = answer(feed_of(lattice), request(lattice, 40, simulations=1024))

@@ -9,6 +9,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from planning.coverage_model import reachable_entropy
+from planning.reward import RewardWeights, leftover_entropy
 from schemas.base import Pose
 from schemas.sensing import Odometry
 from schemas.world import LocalIrm
@@ -222,3 +224,15 @@ def test_the_model_is_the_shared_one() -> None:
     model = model_here(local_irm(lattice), 24, 1, np.zeros(SIZE, np.uint64), CONFIG)
     np.testing.assert_array_equal(model.edge_distance_m, lattice.model().edge_distance_m)
     assert (int(model.particle_node[0]), int(model.particle_heading[0])) == (24, 1)
+
+
+def test_the_model_counts_ground_left_behind_as_lcp_does() -> None:
+    lattice = random_lattice(3, SIZE, 2, wall_share=0.2, covered_share=0.5)
+    irm = local_irm(lattice)
+    found = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), CONFIG).entropy
+    reached = reachable_entropy(irm.entropy, irm.visible, irm.edge_distance_m, irm.size, irm.reach)
+    np.testing.assert_allclose(found, leftover_entropy(reached, irm.state == 1, irm.size, CONFIG.weights))
+    weights = RewardWeights(leftover_weight=0.0, leftover_gain=0.0)
+    paper = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), Config(weights=weights)).entropy
+    np.testing.assert_allclose(paper, reached)
+    assert (found > paper).any()

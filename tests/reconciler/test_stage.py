@@ -11,7 +11,8 @@ import pytest
 from schemas.codec import Envelope, encode
 from schemas.contract import SECOND_NS, StageSetup
 from schemas.operation import MissionPhase
-from schemas.policy import Plan, SafetyState
+from schemas.policy import LocalPhase, Plan, SafetyState
+from schemas.snapshot import unpack_snapshot
 from schemas.topics import LOCAL_POLICY, RISK_MAP
 from services.reconciler.config import Config
 from services.reconciler.stage import create, spec
@@ -278,6 +279,80 @@ def test_answers_to_old_episodes_are_dropped() -> None:
     assert len(rig.delivered) >= 2, "they came"
     assert all(policy.episode < rig.requests[-1].episode for policy in rig.delivered)
     assert not any(plan.valid for plan in rig.plans)
+
+
+def late(rig: Rig, ticks: int) -> Plan:
+    """The next answer takes so many ticks; the plan just before it comes. The robot drives meanwhile."""
+    asked, rig.answer_delay = len(rig.requests), ticks
+    while len(rig.requests) == asked:
+        rig.tick()
+    wanted, before = rig.requests[asked], rig.last()
+    while not any(policy.episode == wanted.episode for policy in rig.delivered):
+        before = rig.last()
+        rig.tick()
+    return before
+
+
+def test_an_answer_that_comes_after_its_junction_is_dropped() -> None:
+    """Driven back to a junction that it has passed, the robot would turn round at every late answer."""
+    rig = driving(4.0, config=Config(simulations=256, max_kept_m=1.0))
+    before = late(rig, 25)
+    wanted = rig.requests[-1]
+    assert rig.now > wanted.junction_ns + SECOND_NS // 2, "the robot is well beyond the junction"
+    after = rig.last()
+    assert after.reason == "the answer came after its junction"
+    np.testing.assert_array_equal(points(after)[-1], points(before)[-1])
+    ahead = {p.tobytes() for p in points(before)}
+    assert after.valid and all(p.tobytes() in ahead for p in points(after)), "it drives on along the old path"
+
+
+def test_an_answer_in_time_is_driven() -> None:
+    rig = driving(4.0, config=Config(simulations=256, max_kept_m=1.0))
+    before = late(rig, 3)
+    assert rig.last().plan_id > before.plan_id
+    assert rig.last().reason.startswith(("covers", "guides"))
+
+
+def test_tau_grows_with_the_latency_that_was_measured_and_shrinks_again_by_degrees() -> None:
+    """Slow answers are expected to stay slow: the next junction lies beyond what is driven until they come."""
+    taus = []
+    rig = driving(4.0, config=Config(simulations=256, max_kept_m=1.0))
+    for delay in (3, 25, 3, 3, 3, 3, 3, 3):
+        late(rig, delay)
+        rig.answer_delay, asked = 3, len(rig.requests)
+        while len(rig.requests) == asked:
+            rig.tick()
+        wanted = rig.requests[-1]
+        taus.append((wanted.junction_ns - wanted.stamp_ns) / SECOND_NS)
+    fast, slow, later = taus[0], taus[1], taus[-1]
+    assert fast < 2.0
+    assert slow > 1.2 * 2.5 * 0.8, "at nearly full speed"
+    assert later < slow - 1.0
+
+
+@pytest.mark.parametrize(
+    ("root", "rollout", "phase", "expected"),
+    [
+        (3.0, 2.0, LocalPhase.COVER, 1.1),
+        (9.0, 2.0, LocalPhase.COVER, 1.2),
+        (1.0, 2.0, LocalPhase.COVER, 1.0),
+        (3.0, 0.05, LocalPhase.COVER, 1.0),
+        (3.0, 2.0, LocalPhase.GUIDE, 1.0),
+    ],
+)
+def test_what_planning_gains_over_its_rollouts_is_learnt_from_answers(
+    root: float, rollout: float, phase: LocalPhase, expected: float
+) -> None:
+    """A fifth of the way to the answer's own ratio, which counts from 1 to 2; tiny values and guidance teach nothing."""
+    rig = Rig()
+    while not rig.answers:
+        rig.tick()
+    due, policy = rig.answers.pop()
+    update = {"root_value": root, "rollout_value": rollout, "phase": phase}
+    rig.answers.append((due, policy.model_copy(update=update)))
+    while not rig.delivered:
+        rig.tick()
+    assert unpack_snapshot(rig.reconciler.stage.snapshot())["value_ratio"] == pytest.approx(expected)
 
 
 def test_an_answer_that_nobody_asked_for_changes_nothing() -> None:
