@@ -66,6 +66,9 @@ class Config(BaseModel):
     unknown_depth_m: float = Field(
         0.5, ge=0, le=20, description="Unknown ground expected behind a border, m."
     )
+    opening_min_m: float = Field(
+        0.5, gt=0, le=10, description="A border on the unknown so long is always a frontier (the robot fits), m."
+    )
     unknown_max_gain: float = Field(
         3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats."
     )

@@ -214,7 +214,10 @@ def find_frontiers(
     piece_of = np.zeros(blocks, np.int64)
     inside = block >= 0
     piece_of[block[inside]] = labels[inside]
-    return _select(gain, places, piece_of, window, config.frontier_min_gain if least is None else least)
+    least = config.frontier_min_gain if least is None else least
+    opening = hidden >= config.opening_min_m / s.resolution_m - 1e-9
+    gain[opening] = np.maximum(gain[opening], least)
+    return _select(gain, places, piece_of, window, least)
 
 
 def solid(unseen: NDArray[np.bool_]) -> NDArray[np.bool_]:

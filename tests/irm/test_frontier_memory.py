@@ -12,7 +12,7 @@ from planning.coverage import LOG_2
 from planning.grid import FREE, LETHAL, UNKNOWN
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from services.irm.config import Config
-from services.irm.frontiers import Frontier, FrontierManager, beside, find_frontiers, solid
+from services.irm.frontiers import Frontier, FrontierManager, beside, find_frontiers, least_gain, solid
 from services.irm.window import Window
 from tests.irm.worlds import Belief, room
 
@@ -37,9 +37,11 @@ class Scene:
     def find(self) -> list[tuple[float, float, float]]:
         return find_frontiers(self.window(), self.config)
 
-    def round(self, robot: tuple[float, float] = ROBOT) -> dict[int, Frontier]:
+    def round(self, robot: tuple[float, float] = ROBOT, ground_m2: float = 0.0) -> dict[int, Frontier]:
         """One update, a second after the last one."""
-        self.next_id = self.manager.update(self.window(), robot, self.rounds * SECOND, 1.0, self.next_id)
+        self.next_id = self.manager.update(
+            self.window(), robot, self.rounds * SECOND, 1.0, self.next_id, ground_m2
+        )
         self.rounds += 1
         return self.manager.frontiers
 
@@ -114,6 +116,50 @@ def test_ground_that_was_known_and_forgotten_is_no_edge_of_the_unseen() -> None:
     assert scene.find() == []
     scene.forget(2.0, 9.0)
     assert scene.find() == []
+
+
+# --- what is worth a trip -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("ground_m2", "spacing_m", "least"),
+    [
+        (0.0, 1.0, 0.1),
+        (100.0, 1.0, 0.1),
+        (500.0, 1.0, 0.25 * LOG_2),
+        (500.0, 0.8, 0.25 * LOG_2 / 0.64),
+        (1e6, 1.0, 0.5),
+    ],
+)
+def test_the_least_gain_is_a_share_of_the_known_ground_within_its_bounds(
+    ground_m2: float, spacing_m: float, least: float
+) -> None:
+    config = Config(
+        frontier_min_gain=0.1, frontier_min_share=0.0005, frontier_enough_gain=0.5, spacing_m=spacing_m
+    )
+    assert least_gain(config, ground_m2) == pytest.approx(least)
+
+
+def test_in_a_large_world_little_ground_is_no_frontier_and_what_was_one_goes() -> None:
+    scene = Scene()
+    x, y = np.meshgrid(scene.flat.spec.centres_x(), scene.flat.spec.centres_y())
+    corner = (x > 7.2) & (y > 3.2)
+    scene = Scene(covered_to_m=-99.0)
+    scene.belief.cover(scene.flat.spec, ~corner)
+    scene.round(ground_m2=100.0)
+    assert 0.1 < scene.only().gain < 0.45
+    assert scene.round(ground_m2=1e5) == {}, "it is there still, but not worth a trip"
+    assert scene.manager.given_up == []
+    assert len(scene.round(ground_m2=100.0)) == 1
+
+
+def test_the_window_may_be_elsewhere_when_a_frontier_becomes_too_little() -> None:
+    scene = Scene(covered_to_m=2.0)
+    scene.manager.frontiers = {k: Frontier(k, 500.0 + k, 0.0, gain) for k, gain in ((1, 0.3), (2, 0.6))}
+    scene.next_id = 3
+    assert {1, 2} <= set(scene.round(ground_m2=100.0))
+    after = scene.round(ground_m2=1e5)
+    assert 1 not in after and 2 in after
 
 
 # --- which frontiers are kept -------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ class _Model(NamedTuple):
 
 @njit_borrowing
 def _borrowed(model: _Model, index: int) -> float:
-    return model.weights[index] * 2.0 + model.offsets[index]
+    return float(model.weights[index] * 2.0 + model.offsets[index])
 
 
 @njit
@@ -32,12 +32,12 @@ def _sum_borrowed(model: _Model) -> float:
 
 @njit_borrowing
 def _allocates(n: int) -> float:
-    return np.zeros(n).sum()
+    return float(np.zeros(n).sum())
 
 
 @njit
 def _allocates_and_owns(n: int) -> float:
-    return np.zeros(n).sum()
+    return float(np.zeros(n).sum())
 
 
 @njit
@@ -47,12 +47,12 @@ def _divides(a: float, b: float) -> float:
 
 def test_a_borrowing_kernel_gives_what_plain_python_gives() -> None:
     rng = np.random.default_rng(1)
-    model = _Model(rng.normal(size=20), rng.integers(-5, 5, 20))
+    model = _Model(rng.normal(size=20), rng.integers(-5, 5, 20, dtype=np.int64))
     assert _sum_borrowed(model) == pytest.approx(float((2.0 * model.weights + model.offsets).sum()))
-    held = [np.ones(3), np.ones(3, np.int64)]
+    held = _Model(np.ones(3), np.ones(3, np.int64))
     for _ in range(1000):  # a reference counted wrongly would free or leak the arrays
-        _sum_borrowed(_Model(held[0], held[1]))
-    assert held[0].tolist() == [1.0] * 3 and held[1].tolist() == [1] * 3
+        _sum_borrowed(held)
+    assert held.weights.tolist() == [1.0] * 3 and held.offsets.tolist() == [1] * 3
 
 
 def test_a_borrowing_kernel_that_makes_arrays_is_refused() -> None:
