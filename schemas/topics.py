@@ -81,7 +81,7 @@ RISK_MAP: Topic[RiskMap] = _topic(
     period_ms=200, stale_ms=1500, max_bytes=16 * _MIB, link=True,
 )  # fmt: skip
 LOCAL_IRM: Topic[LocalIrm] = _topic(
-    LocalIrm, "irm/local_irm", "lcp reconciler status", "the Local IRM", period_ms=500, stale_ms=3000,
+    LocalIrm, "irm/local_irm", "lcp reconciler status", "the Local IRM", period_ms=500, keep_all=True, stale_ms=3000,
     max_bytes=4 * _MIB, link=True,
 )  # fmt: skip
 GLOBAL_IRM: Topic[GlobalIrm] = _topic(

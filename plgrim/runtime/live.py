@@ -7,6 +7,7 @@ steps the stage, so that steps never overlap and signals are served between them
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 
 import zenoh
@@ -36,7 +37,9 @@ def run_stage(name: str, config: Config, stop: threading.Event) -> None:
         if hasattr(module, "warm_up"):
             module.warm_up()
         with world_errors(name):
-            stage: Stage = module.create(options, StageSetup(config.robot, config.seed))
+            stage: Stage = module.create(
+                options, StageSetup(config.robot, config.seed, stopwatch=time.monotonic)
+            )
         return module.spec(options), stage
 
     drive(name, config, make, stop)

@@ -54,11 +54,18 @@ class Config(BaseModel):
     frontier_reach_m: float = Field(
         8.0, ge=1, le=50, description="Ground up to here counts for a frontier, m."
     )
-    frontier_min_gain: float = Field(0.1, gt=0, le=10, description="Less is no frontier anywhere, nats of patches.")
-    frontier_min_share: float = Field(
-        0.0005, ge=0, le=0.1, description="Less than this share of the ground known is no frontier (in large worlds),"
+    frontier_min_gain: float = Field(
+        0.1, gt=0, le=10, description="Less is no frontier anywhere, nats of patches."
     )
-    frontier_enough_gain: float = Field(0.5, gt=0, le=10, description="but so much always is one, nats of patches.")
+    frontier_min_share: float = Field(
+        0.0005,
+        ge=0,
+        le=0.1,
+        description="Less than this share of the ground known is no frontier (in large worlds),",
+    )
+    frontier_enough_gain: float = Field(
+        0.5, gt=0, le=10, description="but so much always is one, nats of patches."
+    )
     frontier_same_m: float = Field(
         2.5, ge=0, le=20, description="A frontier this near to an old one is that one."
     )
@@ -67,7 +74,10 @@ class Config(BaseModel):
         0.5, ge=0, le=20, description="Unknown ground expected behind a border, m."
     )
     opening_min_m: float = Field(
-        0.5, gt=0, le=10, description="A border on the unknown so long is always a frontier (the robot fits), m."
+        0.5,
+        gt=0,
+        le=10,
+        description="A border on the unknown so long is always a frontier (the robot fits), m.",
     )
     unknown_max_gain: float = Field(
         3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats."

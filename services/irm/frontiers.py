@@ -66,7 +66,7 @@ class FrontierManager:
         next_id: int,
         ground_m2: float = 0.0,
     ) -> int:
-        """Look at the window again. elapsed_s: since the last call; ground_m2: known so far. Returns the next free id."""
+        """Look at the window again. elapsed_s: since the last call; ground_m2: known so far. Returns the next id."""
         self.given_up = [g for g in self.given_up if g.until_ns > now_ns]
         least = least_gain(self.config, ground_m2)
         found = [f for f in find_frontiers(window, self.config, least) if not self._is_given_up(f[0], f[1])]

@@ -70,9 +70,6 @@ class IrmStage:
         self._pending: list[CoverageScan] = []
         self._penalties: list[tuple[int, float, float]] = []
         self._global_ns = -(10**18)
-        self._reachable_cells = 0
-        self._covered_cells = 0
-        self._entropy_left = 0.0
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One round of Algorithm 1; nothing while the risk map or the pose is missing or stale."""
