@@ -77,7 +77,7 @@ class Config(BaseModel):
         0.5,
         gt=0,
         le=10,
-        description="A border on the unknown so long is always a frontier (the robot fits), m.",
+        description="A border on the unknown so long is always a frontier, m.",
     )
     unknown_max_gain: float = Field(
         3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats."
