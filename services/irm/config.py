@@ -74,7 +74,7 @@ class Config(BaseModel):
         0.5, ge=0, le=20, description="Unknown ground expected behind a border, m."
     )
     opening_min_m: float = Field(
-        0.5,
+        0.3,
         gt=0,
         le=10,
         description="A border on the unknown so long is always a frontier, m.",
