@@ -113,7 +113,7 @@ class FrontierManager:
             return
         frontier.missed += 1
         if frontier.missed > self.config.missed_rounds:
-            if window.free_space[near].any():
+            if window.reachable[near].any():
                 del self.frontiers[frontier.node_id]
             else:
                 self.give_up(frontier, "cut off: no way for the robot was found", now_ns)
@@ -210,13 +210,14 @@ def find_frontiers(
     block_gains(window.entropy, unknown, block, gain, sums, hidden)
     unknown_gain = config.unknown_depth_m * s.resolution_m * LOG_2 / config.spacing_m**2
     gain += np.minimum(hidden * unknown_gain, config.unknown_max_gain)
-    places = block_places(window.free_space, block, sums, round(1.0 / s.resolution_m))
+    places = block_places(window.reachable, block, sums, round(1.0 / s.resolution_m))
     piece_of = np.zeros(blocks, np.int64)
     inside = block >= 0
     piece_of[block[inside]] = labels[inside]
     least = config.frontier_min_gain if least is None else least
     opening = hidden >= config.opening_min_m / s.resolution_m - 1e-9
-    gain[opening] = np.maximum(gain[opening], least)
+    # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
+    gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
     return _select(gain, places, piece_of, window, least)
 
 

@@ -38,6 +38,7 @@ class Window:
     hazard: NDArray[np.float32]
     step_cost: NDArray[np.float32]
     free_space: NDArray[np.bool_]
+    reachable: NDArray[np.bool_]
     ground: NDArray[np.bool_]
     uncovered: NDArray[np.bool_]
     probability: NDArray[np.float32]
@@ -74,10 +75,12 @@ def build_window(
     )
     robot = spec.cell_of(x_m, y_m)
     free_space = connected_free_space(passable, robot)
+    forgotten = before & (risk.state == UNKNOWN)
+    reachable = connected_free_space(passable | forgotten, robot)
     ground = np.zeros(spec.shape, dtype=np.bool_)
-    dilate_disc(free_space, risk.footprint_radius_m / g.resolution_m, ground)
+    dilate_disc(reachable, risk.footprint_radius_m / g.resolution_m, ground)
     ground &= risk.state == FREE
-    ground |= before & (risk.state == UNKNOWN)
+    ground |= forgotten
     layer[risk.state != UNKNOWN] = KNOWN
     layer[ground] = GROUND
     ground_layer.write(spec, layer)
@@ -93,6 +96,7 @@ def build_window(
         hazard=hazard,
         step_cost=_step_cost(hazard, risk.clearance_m, needed, config.comfort_clearance_m),
         free_space=free_space,
+        reachable=reachable,
         ground=ground,
         uncovered=uncovered,
         probability=p,

@@ -93,13 +93,36 @@ def test_covered_ground_at_the_edge_of_the_unseen_is_a_frontier_and_beside_a_wal
     assert gain == pytest.approx(min(cells * 0.5 * RES * LOG_2, 3.0), rel=0.1)
 
 
-@pytest.mark.parametrize(("depth_m", "most", "gain"), [(20.0, 2.0, 2.0), (20.0, 1.0, 1.0), (0.0, 2.0, None)])
-def test_the_unseen_counts_up_to_a_limit_and_not_at_all_when_nothing_is_expected_there(
-    depth_m: float, most: float, gain: float | None
+@pytest.mark.parametrize(("depth_m", "most", "gain"), [(20.0, 2.0, 2.0), (20.0, 1.0, 1.0), (0.0, 2.0, 0.4)])
+def test_the_unseen_counts_up_to_a_limit_and_at_least_as_an_opening(
+    depth_m: float, most: float, gain: float
 ) -> None:
-    scene = Scene(unknown_depth_m=depth_m, unknown_max_gain=most)
+    scene = Scene(unknown_depth_m=depth_m, unknown_max_gain=most, frontier_enough_gain=0.4)
     scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
-    assert [g for _, _, g in scene.find()] == ([] if gain is None else [pytest.approx(gain)])
+    assert [g for _, _, g in scene.find()] == [pytest.approx(gain)]
+
+
+@pytest.mark.parametrize(("width_m", "found"), [(0.2, 0), (0.6, 1), (1.0, 1)])
+def test_an_opening_that_is_wide_enough_is_a_frontier_however_large_the_world(
+    width_m: float, found: int
+) -> None:
+    """Nothing else is worth a trip in this world. Openings are of whole cells of 0.2 m; the least is 0.5 m."""
+    scene = Scene(opening_min_m=0.5, unknown_depth_m=0.0)
+    scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
+    scene.flat.fill(4.0, 0.8, 4.2, 4.2, LETHAL)
+    scene.flat.fill(4.0, 2.4, 4.2, 2.4 + width_m, FREE)
+    scene.belief.cover(scene.flat.spec, scene.flat.state == FREE)
+    assert len(scene.round(ground_m2=1e5)) == found
+
+
+def test_an_opening_out_of_sight_stays_a_frontier_when_the_known_ground_grows() -> None:
+    scene = Scene(unknown_depth_m=0.0)
+    scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
+    scene.round(ground_m2=50.0)
+    name = scene.only().node_id
+    away = scene.belief.window(scene.flat.risk_map(*ROBOT, window_m=6.0), *ROBOT)
+    scene.manager.update(away, ROBOT, 9 * SECOND, 1.0, scene.next_id, 1e5)
+    assert scene.only().node_id == name
 
 
 def test_gaps_between_far_rays_are_no_frontier() -> None:

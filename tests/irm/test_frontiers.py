@@ -37,6 +37,8 @@ CONFIG = Config(
     frontier_min_gain=0.3,
     unknown_depth_m=1.0,
     unknown_max_gain=1.5,
+    opening_min_m=1.5,
+    frontier_enough_gain=0.7,
     spacing_m=1.0,
 )
 
@@ -150,8 +152,10 @@ def _brute_hidden(window: Window) -> NDArray[np.bool_]:
     return grown
 
 
-def _gains(window: Window) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
-    """(block of each cell, gain of each block, pieces) by brute force."""
+def _gains(
+    window: Window, openings: bool = True
+) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
+    """(block of each cell, gain of each block, pieces) by brute force. openings: three hidden cells are enough."""
     block, blocks, labels = blocks_of(window, CONFIG)
     spread_blocks(open_of(window), block, round(CONFIG.frontier_reach_m / RES), blocks)
     bonus, hidden = CONFIG.unknown_depth_m * RES * LOG_2, _brute_hidden(window)
@@ -160,13 +164,16 @@ def _gains(window: Window) -> tuple[NDArray[np.int32], NDArray[np.float64], NDAr
         + min(bonus * int(hidden[block == b].sum()), CONFIG.unknown_max_gain)
         for b in range(blocks)
     ]
+    for b in range(blocks):
+        if openings and int(hidden[block == b].sum()) >= 3:
+            gains[b] = max(gains[b], CONFIG.frontier_enough_gain)
     return block, np.array(gains), labels
 
 
 @given(seed=st.integers(0, 100_000))
 def test_a_gain_is_the_entropy_of_its_cells_and_of_the_unseen_beside_them(seed: int) -> None:
     window = random_window(seed)
-    block, gains, _ = _gains(window)
+    block, gains, _ = _gains(window, openings=False)
     gain, hidden, sums = np.zeros(len(gains)), np.zeros(len(gains)), np.zeros((len(gains), 3))
     block_gains(window.entropy, solid(window.unseen), block, gain, sums, hidden)
     bonus = CONFIG.unknown_depth_m * RES * LOG_2
@@ -251,7 +258,7 @@ def test_in_a_real_window_every_piece_of_open_ground_has_a_frontier(seed: int, s
     most = float(window.entropy.sum(dtype=np.float64)) + bonus * int(
         (open_ground & _brute_hidden(window)).sum()
     )
-    assert sum(g for _, _, g in found) <= most + 1e-4
+    assert sum(g for _, _, g in found) <= most + config.frontier_enough_gain * len(found) + 1e-4
 
 
 def _manager(**changes: float) -> tuple[FrontierManager, Belief, Flat]:
