@@ -58,11 +58,22 @@ def random_window(seed: int) -> Window:
     other = ndimage.gaussian_filter(rng.normal(size=spec.shape), 1.5)
     uncovered = ground & (other > np.quantile(other, rng.uniform(0.0, 0.9)))
     entropy = np.where(ground, rng.uniform(0.0, LOG_2, spec.shape) * RES**2, 0.0).astype(np.float32)
-    free_space = ground & (rng.random(spec.shape) < 0.8)
+    reachable = ground & (rng.random(spec.shape) < 0.8)
     zeros = np.zeros(spec.shape, np.float32)
-    robot = (int(rng.integers(0, 21)), int(rng.integers(0, 26)))
     return Window(
-        spec, state, unseen, zeros, zeros, zeros + 1, free_space, ground, uncovered, zeros, entropy, robot
+        spec=spec,
+        state=state,
+        unseen=unseen,
+        clearance_m=zeros,
+        hazard=zeros,
+        step_cost=zeros + 1,
+        free_space=reachable & (rng.random(spec.shape) < 0.5),
+        reachable=reachable,
+        ground=ground,
+        uncovered=uncovered,
+        probability=zeros,
+        entropy=entropy,
+        robot_cell=(int(rng.integers(0, 21)), int(rng.integers(0, 26))),
     )
 
 
@@ -185,30 +196,30 @@ def test_a_gain_is_the_entropy_of_its_cells_and_of_the_unseen_beside_them(seed: 
 
 
 @given(seed=st.integers(0, 100_000))
-def test_a_place_is_in_free_space_near_its_block_and_best_for_it(seed: int) -> None:
+def test_a_place_can_be_reached_near_its_block_and_is_best_for_it(seed: int) -> None:
     window = random_window(seed)
     block, gains, _ = _gains(window)
     sums = np.zeros((len(gains), 3))
     block_gains(window.entropy, solid(window.unseen), block, np.zeros(len(gains)), sums, np.zeros(len(gains)))
     reach = 2
-    places = block_places(window.free_space, block, sums, reach)
-    free = np.argwhere(window.free_space)
+    places = block_places(window.reachable, block, sums, reach)
+    free = np.argwhere(window.reachable)
     for b, place in enumerate(places):
         cells = np.argwhere(block == b)
         middle = cells.mean(axis=0)
         best = math.inf
         for cell in cells:
-            near = 0 if window.free_space[tuple(cell)] else reach
+            near = 0 if window.reachable[tuple(cell)] else reach
             for f in free[np.abs(free - cell).max(axis=1) <= near]:
                 best = min(best, float(((f - middle) ** 2).sum() + 4 * ((f - cell) ** 2).sum()))
         if math.isinf(best):
             assert place.tolist() == [-1, -1]
             continue
-        assert window.free_space[tuple(place)]
+        assert window.reachable[tuple(place)]
         score = min(
             float(((place - middle) ** 2).sum() + 4 * ((place - cell) ** 2).sum())
             for cell in cells
-            if np.abs(place - cell).max() <= (0 if window.free_space[tuple(cell)] else reach)
+            if np.abs(place - cell).max() <= (0 if window.reachable[tuple(cell)] else reach)
         )
         assert score == pytest.approx(best)
 
@@ -219,16 +230,16 @@ def test_every_piece_that_is_worth_it_has_a_frontier_and_no_gain_counts_twice(se
     found = find_frontiers(window, CONFIG)
     block, gains, labels = _gains(window)
     for x, y, _ in found:
-        assert window.free_space[window.spec.cell_of(x, y)]
+        assert window.reachable[window.spec.cell_of(x, y)]
     assert sum(g for _, _, g in found) <= gains.sum() + 1e-6
     alone = [g for g in gains if g >= CONFIG.frontier_min_gain]
     for piece in range(1, int(labels.max()) + 1):
         mine = np.unique(block[(labels == piece) & (block >= 0)])
         worth = gains[mine].sum() >= CONFIG.frontier_min_gain
-        cells = np.isin(block, mine) & window.free_space
-        if worth and cells.any():  # a block that has free space itself has a place
+        cells = np.isin(block, mine) & window.reachable
+        if worth and cells.any():  # a block that can be reached itself has a place
             best = mine[int(np.argmax(gains[mine]))]
-            if (window.free_space & (block == best)).any():
+            if (window.reachable & (block == best)).any():
                 expected = gains[best] if gains[best] in alone else gains[mine].sum()
                 assert any(g == pytest.approx(expected, abs=1e-5) for _, _, g in found)
     assert all(g >= CONFIG.frontier_min_gain - 1e-9 for _, _, g in found)

@@ -115,6 +115,25 @@ def test_ground_is_remembered_where_the_map_has_forgotten_it_and_goes_when_it_tu
     assert not solid.ground[flat.spec.cell_of(2.0, 0.0)]
 
 
+def test_ground_beyond_what_the_map_has_forgotten_can_still_be_reached_but_not_beyond_the_unseen() -> None:
+    """No path is searched over forgotten ground (it is no free space), and what turns out lethal ends it."""
+    beyond, gap = (2.0, 0.0), (0.0, -3.0, 1.0, 3.0)
+    for seen_before in (True, False):
+        flat, belief = room(-3, -3, 3, 3), Belief.new(Config(), RES)
+        cell = flat.spec.cell_of(*beyond)
+        if seen_before:
+            belief.window(flat.risk_map(), -2.0, 0.0)
+        window = belief.window(flat.fill(*gap, UNKNOWN).risk_map(), -2.0, 0.0)
+        assert not window.free_space[cell]
+        assert bool(window.reachable[cell]) is seen_before
+        assert bool(window.ground[cell]) is seen_before
+        assert not (window.free_space & ~window.reachable).any()
+    belief = Belief.new(Config(), RES)
+    belief.window(room(-3, -3, 3, 3).risk_map(), -2.0, 0.0)
+    shut = belief.window(flat.fill(*gap, LETHAL).risk_map(), -2.0, 0.0)
+    assert not shut.reachable[cell] and not shut.ground[cell]
+
+
 def test_unseen_is_what_no_risk_map_ever_knew_wherever_the_robot_is_by_now() -> None:
     flat = two_rooms(0.4)
     flat.fill(2.0, -1.0, 3.0, 1.0, UNKNOWN)
