@@ -36,7 +36,7 @@ class Config(BaseModel):
     )
     # traversability
     clearance_margin_m: float = Field(0.0, ge=-0.05, le=1, description="Added to the footprint's radius, m.")
-    clearance_hysteresis_m: float = Field(0.015, ge=0, le=0.2, description="What was passable stays so, m.")
+    clearance_hysteresis_m: float = Field(0.03, ge=0, le=0.2, description="What was passable stays so, m.")
     hazard_margin_m: float = Field(0.1, ge=0, le=1, description="Hazard is felt this far around the body, m.")
     comfort_clearance_m: float = Field(
         0.5, ge=0, le=3, description="Nearer to obstacles a path costs more, m."

@@ -81,7 +81,7 @@ class FrontierManager:
             taken.add(index)
             frontier = self.frontiers[node_id]
             if math.hypot(found[index][0] - frontier.x_m, found[index][1] - frontier.y_m) > 0.5:
-                frontier.beside_s = 0.0
+                frontier.beside_s, frontier.pursued_s, frontier.nearest_m = 0.0, 0.0, math.inf
             frontier.x_m, frontier.y_m, frontier.gain = found[index]
             frontier.seen, frontier.missed = True, 0
         for frontier in inside:

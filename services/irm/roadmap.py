@@ -142,11 +142,15 @@ class Roadmap:
                 continue
             search = _Search(window)
             search.run(cell, self.config.max_edge_m)
-            self.graph.remove_edges_from([(node, n) for n in old])
-            joined = 0
+            joined: set[int] = set()
             for _, other in sorted(self._near(f.x_m, f.y_m, self.config.max_edge_m, BREADCRUMB)):
-                if other != ROBOT and joined < 3:
-                    joined += self._join(node, other, search)
+                if other != ROBOT and len(joined) < 3 and self._join(node, other, search):
+                    joined.add(other)
+            if joined:  # else the risk map has forgotten the ground around it, which is no evidence
+                self.graph.remove_edges_from([(node, n) for n in old if n not in joined])
+            for other in old if not joined else []:
+                edge = self.graph.edges[node, other]
+                edge["distance"] = max(edge["distance"], math.dist((f.x_m, f.y_m), self._place(other)))
             data["joined_at"] = (f.x_m, f.y_m)
             if (
                 not joined
