@@ -86,6 +86,8 @@ class Config(BaseModel):
     pursue_s: float = Field(
         90.0, gt=0, le=3600, description="A target that comes no nearer is given up then, s."
     )
+    patience_gain: float = Field(2.0, gt=0, le=100, description="A frontier worth so much, nats,")
+    patience: float = Field(5.0, ge=1, le=100, description="is waited for so many times longer.")
     give_up_radius_m: float = Field(1.5, gt=0, le=10, description="How near that is, m.")
     retry_after_s: float = Field(
         600.0, gt=0, le=1e5, description="A given-up frontier may come back then, s."

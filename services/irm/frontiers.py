@@ -137,8 +137,17 @@ class FrontierManager:
                 f.best_gain, f.beside_s, f.pursued_s = f.gain, 0.0, 0.0
             if math.hypot(f.x_m - robot[0], f.y_m - robot[1]) <= self.config.give_up_radius_m:
                 f.beside_s += elapsed_s
-            if f.beside_s > self.config.give_up_s:
+            if f.beside_s > self.config.give_up_s * self._patience(f):
                 self.give_up(f, "stood beside it and saw nothing new", now_ns)
+
+    def _patience(self, frontier: Frontier) -> float:
+        """Much to gain is not given up lightly: the mission would end with it uncovered."""
+        return 1.0 if frontier.gain < self.config.patience_gain else self.config.patience
+
+    def progressed(self) -> None:
+        """Ground was covered somewhere: the robot has better to do than to go to its target, which loses no time."""
+        for frontier in self.frontiers.values():
+            frontier.pursued_s = 0.0
 
     def pursue(self, node_id: int, distance_m: float, now_ns: int, elapsed_s: float) -> None:
         """The global planner's target is this frontier, so far away: give it up when the robot gets no nearer."""
@@ -149,7 +158,7 @@ class FrontierManager:
             f.nearest_m, f.pursued_s = distance_m, 0.0
             return
         f.pursued_s += elapsed_s
-        if f.pursued_s > self.config.pursue_s:
+        if f.pursued_s > self.config.pursue_s * self._patience(f):
             self.give_up(f, "pursued in vain: the robot got no nearer", now_ns)
 
     def give_up(self, frontier: Frontier, reason: str, now_ns: int) -> None:

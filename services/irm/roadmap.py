@@ -149,8 +149,9 @@ class Roadmap:
             if joined:  # else the risk map has forgotten the ground around it, which is no evidence
                 self.graph.remove_edges_from([(node, n) for n in old if n not in joined])
             for other in old if not joined else []:
-                edge = self.graph.edges[node, other]
-                edge["distance"] = max(edge["distance"], math.dist((f.x_m, f.y_m), self._place(other)))
+                if self.graph.has_edge(node, other):
+                    edge = self.graph.edges[node, other]
+                    edge["distance"] = max(edge["distance"], math.dist((f.x_m, f.y_m), self._place(other)))
             data["joined_at"] = (f.x_m, f.y_m)
             if (
                 not joined

@@ -39,6 +39,7 @@ from services.irm.window import Window, build_window, window_picture
 __all__ = ["Config", "IrmStage", "create", "spec"]
 
 _MAX_PENDING = 50
+_PROGRESS_M2 = 0.3
 
 
 def spec(config: Config) -> StageSpec:
@@ -70,6 +71,7 @@ class IrmStage:
         self._pending: list[CoverageScan] = []
         self._penalties: list[tuple[int, float, float]] = []
         self._global_ns = -(10**18)
+        self._covered_m2 = 0.0
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One round of Algorithm 1; nothing while the risk map or the pose is missing or stale."""
@@ -153,21 +155,24 @@ class IrmStage:
         elapsed = min(since, 2.0 * self._config.global_period_s) if self._global_ns >= 0 else 0.0
         self._global_ns = now
         place = planar(odometry.map_to_odom).compose(planar(odometry.pose))
+        ground_m2, covered_m2 = self._areas()
+        if covered_m2 >= self._covered_m2 + _PROGRESS_M2:
+            self._covered_m2 = covered_m2
+            self._roadmap.manager.progressed()
         if policy is not None:
             self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, elapsed)
-        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, self._areas()[0])
+        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, ground_m2)
         first = self._roadmap.version == 0
         message = self._roadmap.message(odometry.pose, odometry.map_to_odom, now, whole or first)
         s = window.spec
         header = GridHeader(resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, width=s.width, height=s.height)
         return [
             Output(GLOBAL_IRM, message),
-            Output(COVERAGE, self._summary(now)),
+            Output(COVERAGE, self._summary(now, ground_m2, covered_m2)),
             Output(COVERAGE_WINDOW, CoverageWindow(stamp_ns=now, grid=header, cell=window_picture(window))),
         ]
 
-    def _summary(self, now: Stamp) -> CoverageSummary:
-        reachable, covered = self._areas()
+    def _summary(self, now: Stamp, reachable: float, covered: float) -> CoverageSummary:
         given_up = self._roadmap.manager.given_up
         frontiers = self._roadmap.manager.frontiers
         return CoverageSummary(
@@ -210,6 +215,7 @@ class IrmStage:
             "pending": [scan.model_dump() for scan in self._pending],
             "anchors": self._local.state() if self._local else [],
             "global_ns": self._global_ns,
+            "covered_m2": self._covered_m2,
             "resolution": self._ground.resolution_m if self._ground else 0.0,
             "radius": self._local.footprint_radius_m if self._local else 0.0,
             "version": self._local.version if self._local else 0,
@@ -227,6 +233,7 @@ class IrmStage:
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
         self._pending = [CoverageScan(**scan) for scan in state["pending"]]
         self._global_ns = state["global_ns"]
+        self._covered_m2 = state["covered_m2"]
         if state["resolution"]:
             self._ground = TileLayer("uint8", 0, state["resolution"])
             self._ground.set_state(state["ground"])

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from planning.coverage_model import ACTIONS, BITS, rollout_value, search_coverage
-from planning.lattice_graph import travel_costs
+from planning.lattice_graph import spread_values, travel_costs
 from planning.pomcp import PolicyTree, Pomcp, random_stream
 from planning.randomness import stream
 from planning.reward import leftover_entropy, parameters
@@ -31,7 +31,7 @@ from services.lcp.problem import (
     planar,
 )
 
-__all__ = ["Config", "LcpStage", "create", "spec"]
+__all__ = ["Config", "LcpStage", "create", "spec", "warm_up"]
 
 _KEPT_IRMS = 8
 _MAX_RISK = 0.9
@@ -294,3 +294,10 @@ def _nothing(now: Stamp, request: EpisodeRequest, reason: str) -> LocalPolicy:
         child_node=np.zeros(0, np.int32),
         child_observation=np.zeros(0, np.int32),
     )
+
+
+def warm_up() -> None:
+    """Compile what a rehearsal may not need: the spreading of global values (arrays of messages are read-only)."""
+    edges, value = np.zeros((9, 8), np.float32), np.zeros(9)
+    edges.setflags(write=False)
+    spread_values(np.zeros(9), 3, edges, edges, 0.9, 0.0, 0.0, value)

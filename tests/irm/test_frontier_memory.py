@@ -258,7 +258,7 @@ def test_time_beside_a_frontier_begins_anew_when_its_place_moves() -> None:
 
 
 def test_a_target_that_comes_no_nearer_is_given_up() -> None:
-    scene = Scene(covered_to_m=2.0, pursue_s=5.0)
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0, patience=1.0)
     scene.round()
     place = (scene.only().x_m, scene.only().y_m)
     scene.pursue(10.0)
@@ -273,6 +273,28 @@ def test_a_target_that_comes_no_nearer_is_given_up() -> None:
     assert "no nearer" in given_up.reason
     assert given_up.until_ns == scene.rounds * SECOND + int(scene.config.retry_after_s * 1e9)
     assert all(math.dist(place, (f.x_m, f.y_m)) > 1.0 for f in scene.round().values())
+
+
+def test_a_target_with_much_to_gain_is_waited_for_longer() -> None:
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0, patience_gain=0.2, patience=3.0)
+    scene.round()
+    for _ in range(16):
+        scene.pursue(10.0)
+        scene.round()
+    assert len(scene.manager.frontiers) == 1
+    scene.pursue(10.0)
+    assert scene.manager.frontiers == {}
+
+
+def test_progress_elsewhere_takes_the_time_of_a_pursuit_back() -> None:
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0, patience=1.0)
+    scene.round()
+    for _ in range(5):
+        for _ in range(4):
+            scene.pursue(10.0)
+            scene.round()
+        scene.manager.progressed()
+    assert len(scene.manager.frontiers) == 1
 
 
 def test_a_target_that_comes_nearer_is_not_given_up() -> None:

@@ -321,7 +321,7 @@ def test_frontiers_outside_the_window_are_kept_as_they_were() -> None:
 
 
 def test_a_frontier_that_yields_nothing_is_given_up_and_comes_back_after_a_while() -> None:
-    manager, belief, flat = _manager(give_up_s=5.0, retry_after_s=30.0)
+    manager, belief, flat = _manager(give_up_s=5.0, retry_after_s=30.0, patience=1.0)
     _cover_up_to(belief, flat, 6.0)
     window = belief.window(flat.risk_map(), 0.0, 2.5)
     next_id = manager.update(window, (-7.0, 2.5), 0, 1.0, 1)
