@@ -78,6 +78,7 @@ class MissionRecorder:
         self._risk_stamp_ns = 0
         self._belief: list[tuple[float, float]] = []
         self._track: list[tuple[float, ...]] = []
+        self._zero_ns: Stamp | None = None
 
     def observe(self, topic: Topic[Any], message: Message, now: Stamp) -> None:
         """Take in a message. now: mission clock when it was sent, ns."""
@@ -91,8 +92,10 @@ class MissionRecorder:
                 self._add_track(message, now)
             case CoverageSummary():
                 self.coverage = message
-                self._belief.append((now / SECOND_NS, message.covered_fraction))
+                self._belief.append((self._elapsed_s(now), message.covered_fraction))
             case MissionState():
+                if self.mission is None:
+                    self._zero_ns = message.stamp_ns - int(message.elapsed_s * SECOND_NS)
                 self.mission = message
             case Odometry():
                 self.odometry = message
@@ -107,12 +110,18 @@ class MissionRecorder:
             case StageHealth():
                 self._add_health(message)
 
+    def _elapsed_s(self, now: Stamp) -> float:
+        """Time since the mission's start; before its state has come, since the first message that counts."""
+        if self._zero_ns is None:
+            self._zero_ns = now
+        return (now - self._zero_ns) / SECOND_NS
+
     def _add_track(self, judge: JudgeReport, now: Stamp) -> None:
         true = judge.true_pose
         estimate = in_map(self.odometry) if self.odometry else true
         self._track.append(
             (
-                now / SECOND_NS,
+                self._elapsed_s(now),
                 true.x_m,
                 true.y_m,
                 true.yaw_rad,
