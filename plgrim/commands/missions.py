@@ -18,7 +18,7 @@ _DEMO_WORLD = "subway_1x"
 
 def demo(
     seed: Annotated[int, typer.Option(min=0, help="Of the world and of every random stream.")] = 1,
-    speed: Annotated[float, typer.Option(min=0.01, max=100, help="Mission seconds a wall second.")] = 2.0,
+    speed: Annotated[float, typer.Option(min=0.01, max=100, help="Mission seconds a wall second.")] = 2.5,
     out: OutFolder = Path("out/demo"),
     config_file: ConfigFile = None,
 ) -> None:
