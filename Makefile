@@ -6,7 +6,6 @@
 #   make test        the default test suite            make test-slow   the long tests too
 #   make lint        ruff, mypy, import-linter         make format      let ruff rewrite the files
 #   make check       env, lint and test in a clean copy of the tree: what CI runs
-#   make bench       step times of the kernels and stages
 #   make lock        resolve the locks anew            make clean       remove what was made here
 #
 # PYTHON=/path/to/python3.12 chooses the interpreter; UV=no installs with pip alone.
@@ -32,7 +31,7 @@ export UV_LINK_MODE ?= copy
 # Third-party maps and recordings, which the tests that need them skip visibly without.
 export PLGRIM_DATA_DIR ?= $(abspath ../shared/data)
 
-.PHONY: help venv env demo test test-slow lint format check bench lock clean
+.PHONY: help venv env demo test test-slow lint format check lock clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -87,10 +86,6 @@ check:
 	PLGRIM_CACHE_DIR="$$copy/.cache" $(MAKE) -C "$$copy" env lint test
 	rm -rf "$$copy"
 	echo "check: passed"
-
-bench: env
-	@if [ -f plgrim/evaluation/bench.py ]; then $(BIN)/python -m plgrim.evaluation.bench; \
-	else echo "bench: there is no plgrim/evaluation/bench.py yet" >&2; exit 1; fi
 
 # Resolved for Python 3.11 and up on every platform, from the default registry whatever this user's settings are.
 # No file names a download host: the hashes alone say what may be installed.

@@ -38,8 +38,8 @@ class _Runner:
 class Lockstep:
     """Runs stages under a virtual clock.
 
-    options: configuration by service. observer: called with every message when it is released (decoded as the
-    readers see it). digest(): hash of every byte that was published, to compare runs.
+    options: configuration by service. observer: called with every message when a stage has made it.
+    digest(): hash of every byte that was published, to compare runs.
     """
 
     def __init__(

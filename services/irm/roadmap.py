@@ -10,6 +10,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.grid import LETHAL
 from planning.kernels import njit
 from planning.search import dijkstra_box
 from schemas.base import Pose
@@ -103,7 +104,10 @@ class Roadmap:
             self.graph.add_edge(a, b, distance=max(d, 1e-3), risk=rho, driven=driven)
             return True
         known = search.knows(*self._place(b))
-        if known and self.graph.has_edge(a, b) and not (self.graph.edges[a, b]["driven"] and rho < 1.0):
+        if not (known and self.graph.has_edge(a, b)):
+            return False
+        # No way within the window is no evidence against a way that the robot has driven: it may lead around outside.
+        if not self.graph.edges[a, b]["driven"] or search.obstacle_between(self._place(a), self._place(b)):
             self.graph.remove_edge(a, b)
         return False
 
@@ -311,6 +315,16 @@ class _Search:
         """Whether the point lies in the window on known ground, so that 'no path' is evidence."""
         row, column = self._window.spec.cell_of(x_m, y_m)
         return self._window.spec.contains(row, column) and self._window.state[row, column] != 0
+
+    def obstacle_between(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
+        """Whether a lethal cell lies on the straight line between two points."""
+        spec, state = self._window.spec, self._window.state
+        steps = max(1, math.ceil(2.0 * math.dist(a, b) / spec.resolution_m))
+        for i in range(steps + 1):
+            row, column = spec.cell_of(a[0] + (b[0] - a[0]) * i / steps, a[1] + (b[1] - a[1]) * i / steps)
+            if spec.contains(row, column) and state[row, column] == LETHAL:
+                return True
+        return False
 
     def _nearest_reached(self, x_m: float, y_m: float) -> tuple[int, int] | None:
         row, column = self._window.spec.cell_of(x_m, y_m)

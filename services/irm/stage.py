@@ -10,6 +10,7 @@ from planning.frames import Planar
 from planning.grid import GridSpec
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
+from schemas.operation import MissionPhase
 from schemas.policy import GlobalPolicy
 from schemas.sensing import CoverageScan, Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
@@ -22,6 +23,7 @@ from schemas.topics import (
     GLOBAL_IRM,
     GLOBAL_POLICY,
     LOCAL_IRM,
+    MISSION,
     MISSION_GRAPH_REQUEST,
     ODOMETRY,
     POSE_GRAPH,
@@ -94,7 +96,7 @@ class IrmStage:
         due = now - self._global_ns >= self._config.global_period_s * SECOND_NS - SECOND_NS // 100
         if due or asked:
             policy = inputs.current(GLOBAL_POLICY)
-            found += self._global(now, window, odometry, bool(asked), policy)
+            found += self._global(now, window, odometry, bool(asked), policy, _exploring(inputs))
         return found
 
     def _allocate(self, risk: RiskMap) -> None:
@@ -148,11 +150,19 @@ class IrmStage:
         )  # fmt: skip
 
     def _global(
-        self, now: Stamp, window: Window, odometry: Odometry, whole: bool, policy: GlobalPolicy | None
+        self,
+        now: Stamp,
+        window: Window,
+        odometry: Odometry,
+        whole: bool,
+        policy: GlobalPolicy | None,
+        exploring: bool,
     ) -> Outputs:
-        # Neither the first round nor a gap in the inputs is time that the robot stood beside a frontier.
+        # Neither the first round, nor a gap in the inputs, nor a pause is time that the robot stood beside a frontier.
         since = (now - self._global_ns) / SECOND_NS
-        elapsed = min(since, 2.0 * self._config.global_period_s) if self._global_ns >= 0 else 0.0
+        elapsed = (
+            min(since, 2.0 * self._config.global_period_s) if self._global_ns >= 0 and exploring else 0.0
+        )
         self._global_ns = now
         place = planar(odometry.map_to_odom).compose(planar(odometry.pose))
         ground_m2, covered_m2 = self._areas()
@@ -243,3 +253,9 @@ class IrmStage:
             self._store.set_state(state["footprints"])
             self._local = LocalIrmBuilder(self._config, state["radius"], state["version"])
             self._local.set_state(state["anchors"])
+
+
+def _exploring(inputs: Inputs) -> bool:
+    """Whether the robot is sent to frontiers now; without a word from the mission it is taken to be."""
+    mission = inputs.latest(MISSION)
+    return mission is None or mission.message.phase == MissionPhase.EXPLORE
