@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from schemas.base import Array, F32Points, Header, Message, Pose, column
+from schemas.base import Array, F32Points, Message, Pose, column
 
 
 class PointCloud(Message):
@@ -85,12 +85,6 @@ class CoverageScan(Message):
     range_m: float = Field(gt=0, le=100)
     fov_rad: float = Field(gt=0, le=6.2831853072)
     detection_probability: float = Field(gt=0.5, lt=1)
-
-
-class Footprint(Header):
-    """The robot's body on the ground: a disc."""
-
-    radius_m: float = Field(gt=0, le=5)
 
 
 class FollowerState(Message):

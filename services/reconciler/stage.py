@@ -42,7 +42,6 @@ from services.reconciler.tau import choose_tau, tau_terms
 __all__ = ["Config", "ReconcilerStage", "create", "spec"]
 
 _NO_POINTS = np.zeros((0, 2))
-_NO_NODES = np.zeros((0, 2), np.int64)
 _SOON_M = 2.5
 """With less of the path left than this a new episode opens at once."""
 
