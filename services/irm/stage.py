@@ -40,6 +40,8 @@ from services.irm.window import Window, build_window, window_picture
 
 __all__ = ["Config", "IrmStage", "create", "spec"]
 
+_BLOCKED_AGAIN_NS = 5 * SECOND_NS
+"""Blocked at one place again after so long, it counts once more."""
 _MAX_PENDING = 50
 _PROGRESS_M2 = 0.3
 
@@ -126,7 +128,8 @@ class IrmStage:
         if follower is None or not (follower.blocked or follower.stuck):
             return
         ahead = planar(odometry.map_to_odom).compose(planar(odometry.pose)).apply(0.5, 0.0)
-        if all(math.dist(ahead, p[1:]) > 0.3 for p in self._penalties):
+        lately = [p for p in self._penalties if now - p[0] < _BLOCKED_AGAIN_NS]
+        if all(math.dist(ahead, p[1:]) > 0.3 for p in lately):  # again and again: worse and worse
             self._penalties.append((now, *ahead))
 
     def _add_scans(self, risk: RiskMap, odometry: Odometry) -> None:
