@@ -264,6 +264,11 @@ class Roadmap:
         return {
             "nodes": [[n, dict(d)] for n, d in sorted(self.graph.nodes(data=True))],
             "edges": sorted([min(a, b), max(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
+            **self._beside_graph(),
+        }
+
+    def _beside_graph(self) -> dict[str, Any]:
+        return {
             "manager": self.manager.state(),
             "counters": [self.next_id, self.version, self.last_breadcrumb],
         }
@@ -271,6 +276,10 @@ class Roadmap:
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot; the next message is whole."""
         self.graph = nx.Graph()
+        self._set_parts(state)
+
+    def _set_parts(self, state: dict[str, Any]) -> None:
+        """Nodes and edges are added or replaced, the rest is as in the state."""
         for node, data in state["nodes"]:
             if "joined_at" in data:
                 data["joined_at"] = tuple(data["joined_at"])
@@ -279,6 +288,26 @@ class Roadmap:
         self.manager.set_state(state["manager"])
         self.next_id, self.version, self.last_breadcrumb = state["counters"]
         self._published = {}
+
+    def difference(self, message: GlobalIrm) -> dict[str, Any]:
+        """What a message that was just made tells, with all that the graph keeps of it: for the journal."""
+        edges = zip(message.edge_a.tolist(), message.edge_b.tolist(), strict=True)
+        return {
+            "whole": message.base_version == 0,
+            "nodes": [[n, dict(self.graph.nodes[n])] for n in message.node_id.tolist()],
+            "edges": [[a, b, dict(self.graph.edges[a, b])] for a, b in edges],
+            "removed_nodes": message.removed_node.tolist(),
+            "removed_edges": message.removed_edge.tolist(),
+            **self._beside_graph(),
+        }
+
+    def apply_difference(self, difference: dict[str, Any]) -> None:
+        """Take in a difference from the journal; the next message is whole."""
+        if difference["whole"]:
+            self.graph = nx.Graph()
+        self.graph.remove_nodes_from(difference["removed_nodes"])
+        self.graph.remove_edges_from((a, b) for a, b in difference["removed_edges"])
+        self._set_parts(difference)
 
 
 class _Search:

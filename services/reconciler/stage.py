@@ -42,6 +42,8 @@ from services.reconciler.tau import choose_tau, tau_terms
 __all__ = ["Config", "ReconcilerStage", "create", "spec"]
 
 _NO_POINTS = np.zeros((0, 2))
+_SKIPPED_IDS = 10_000
+"""More than the plans and episodes of the longest time between two snapshots."""
 _SOON_M = 2.5
 """With less of the path left than this a new episode opens at once."""
 
@@ -423,6 +425,11 @@ class ReconcilerStage:
         state = unpack_snapshot(snapshot)
         self._episode, self._plan_id = int(state["episode"]), int(state["plan_id"]) + 1
         self._value_ratio = float(state["value_ratio"])
+
+    def resumed(self) -> None:
+        """Ids that were given since the last snapshot are not given again: the follower would take a new plan for an
+        old one."""
+        self._episode, self._plan_id = self._episode + _SKIPPED_IDS, self._plan_id + _SKIPPED_IDS
 
 
 def _age_s(inputs: Inputs, topic: Topic[Message]) -> float | None:
