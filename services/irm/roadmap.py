@@ -265,7 +265,15 @@ class Roadmap:
             "nodes": [[n, dict(d)] for n, d in sorted(self.graph.nodes(data=True))],
             "edges": sorted([min(a, b), max(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
             **self._beside_graph(),
+            "unpublished": self._unpublished(),
         }
+
+    def _unpublished(self) -> list[list[Any]]:
+        """What the last message said otherwise than the graph is now: [key, values], without values for what is new."""
+        now = self._contents() if self._published else {}
+        before = self._published
+        differs = [[k, list(v)] for k, v in before.items() if now.get(k) != v]
+        return differs + [[k, None] for k in now if k not in before]
 
     def _beside_graph(self) -> dict[str, Any]:
         return {
@@ -274,9 +282,16 @@ class Roadmap:
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """From a snapshot; the next message is whole."""
+        """From a snapshot."""
         self.graph = nx.Graph()
         self._set_parts(state)
+        self._published = self._contents() if self.version > 0 else {}
+        for key, values in state["unpublished"]:
+            name = tuple(key) if isinstance(key, list) else key
+            if values is None:
+                del self._published[name]
+            else:
+                self._published[name] = tuple(values)
 
     def _set_parts(self, state: dict[str, Any]) -> None:
         """Nodes and edges are added or replaced, the rest is as in the state."""

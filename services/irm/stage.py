@@ -282,6 +282,7 @@ class IrmStage:
             "version": self._local.version,
             "global_ns": self._global_ns,
             "covered_m2": self._covered_m2,
+            "penalties": self._penalties,
         }
         if self._window_spec is not None:
             record["spec"] = list(self._window_spec)
@@ -301,6 +302,7 @@ class IrmStage:
             self._ground.write(GridSpec(*state["spec"]), state["ground"])
         self._local.version = state["version"]
         self._global_ns, self._covered_m2 = state["global_ns"], state["covered_m2"]
+        self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
 
     def resumed(self) -> None:
         """Versions of the Local IRM that were given since the last record are not given again."""
