@@ -74,6 +74,7 @@ class Journal:
 
     def __init__(self, folder: Path, service: str, durable: bool = True) -> None:
         """durable: wait for the disk, so that a loss of power costs nothing either; not only the process's death."""
+        self.folder, self.service = folder, service
         self._paths = tuple(folder / f"{service}.{slot}.sqlite" for slot in _SLOTS)
         self._synchronous = "FULL" if durable else "NORMAL"
         self._connections: list[sqlite3.Connection | None] = [None, None]

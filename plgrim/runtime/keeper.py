@@ -22,6 +22,9 @@ _LARGEST_SHARE = 0.02
 """Of the time that snapshots may take: expensive ones are taken less often, and the records bridge the longer gap."""
 _NOT_DURABLE = frozenset({"sim"})
 """The simulated world dies with its host: its journal need not wait for the disk, 4 times a second."""
+_TRIES = 3
+"""A state from which so many lives in a row did not get through their first steps is not restored once more."""
+_GOOD_STEPS = 3
 
 
 class Restorable(Protocol):
@@ -54,6 +57,8 @@ class Keeper:
         self._period_s = period_s
         self._stopwatch = stopwatch
         self._due_s = 0.0
+        self._tries = journal.folder / f"{journal.service}.tries"
+        self._steps_to_go = 0
         self.trouble = ""
         self.recovered = False
         self._log = get_logger()
@@ -76,7 +81,11 @@ class Keeper:
         states = self._journal.recover()
         for damage in self._journal.damage:
             self._log.error("journal damaged", what=damage)
+        tries = _read_number(self._tries)
         for state in states:
+            if tries >= _TRIES:
+                self._log.error("the state is not used: no life that began with it went on", tries=tries)
+                break
             if state.saved_ns > now:
                 self._log.warning("journal of another mission: not used", saved_s=state.saved_ns / SECOND_NS)
                 continue
@@ -85,6 +94,8 @@ class Keeper:
                 break
             stage = make()
         if self.recovered:
+            self._steps_to_go = _GOOD_STEPS
+            _write_number(self._tries, tries + 1)
             _tell(stage)
         self._begin(stage, now)
         if self.trouble:
@@ -120,6 +131,10 @@ class Keeper:
 
     def after_step(self, stage: Restorable, now: Stamp) -> None:
         """Take a snapshot when it is time. Call it between steps that went well."""
+        if self._steps_to_go:
+            self._steps_to_go -= 1
+            if not self._steps_to_go:
+                self._tries.unlink(missing_ok=True)
         if self._stopwatch() >= self._due_s:
             self._begin(stage, now)
 
@@ -160,16 +175,25 @@ def next_epoch(config: RuntimeConfig, robot: str, service: str, now_ms: int) -> 
     if not config.state_dir:
         return now_ms
     path = Path(config.state_dir) / robot / f"{service}.epoch"
+    epoch = max(now_ms, _read_number(path) + 1)
+    _write_number(path, epoch)
+    return epoch
+
+
+def _read_number(path: Path) -> int:
+    """The number in a small file; 0 when there is none."""
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return 0
+
+
+def _write_number(path: Path, number: int) -> None:
+    """Write a small file whole or not at all; a failure is logged, for nothing hangs on it alone."""
+    fresh = path.with_suffix(f"{path.suffix}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        last = int(path.read_text(encoding="ascii")) if path.exists() else 0
-    except (OSError, ValueError):
-        last = 0
-    epoch = max(now_ms, last + 1)
-    fresh = path.with_suffix(f".epoch.{os.getpid()}")
-    try:
-        fresh.write_text(str(epoch), encoding="ascii")
+        fresh.write_text(str(number), encoding="ascii")
         fresh.replace(path)
     except OSError as error:
-        get_logger().warning("epoch not kept", error=str(error))
-    return epoch
+        get_logger().warning("not written", file=str(path), error=str(error))

@@ -215,11 +215,11 @@ class Supervisor:
                 f"{child.name} ended with {code} after {len(child.restarts)} restarts within "
                 f"{runtime.restart_window_s:.0f} s. The end of {child.log}:\n{child.tail()}"
             )
-        # What ran well for a while does not fail at its start: no reason to keep the robot waiting.
+        # What ran well for a while does not fail at its start: no reason to keep the robot waiting for it.
         since = child.started_s if child.name == ROUTER else child.ready_s
         stable = since is not None and now - since >= runtime.stable_after_s
         child.failures = 0 if stable else child.failures + 1
-        wait = min(10.0, runtime.backoff_s * 2 ** max(0, child.failures - 1))
+        wait = min(10.0, runtime.backoff_s * 2 ** (child.failures - 1)) if child.failures else 0.0
         child.restarts.append(now)
         child.restarted += 1
         child.restart_at_s = now + wait

@@ -31,7 +31,7 @@ from schemas.world import CoverageSummary, GlobalIrm
 
 MAIN_TOPIC: dict[str, Topic[Message]] = {
     "riskmap": RISK_MAP,
-    "irm": GLOBAL_IRM,
+    "irm": LOCAL_IRM,
     "gcp": GLOBAL_POLICY,
     "lcp": LOCAL_POLICY,
     "reconciler": PLAN,
@@ -94,9 +94,8 @@ class Observer:
             if topic is not health_topic(service):
                 link.subscribe(topic, self._receive, every=True)
             link.subscribe(health_topic(service), self._receive, every=True)
-        for topic in (JUDGE, COVERAGE):
+        for topic in (JUDGE, COVERAGE, GLOBAL_IRM):
             link.subscribe(topic, self._receive, every=True)
-        link.subscribe(LOCAL_IRM, self._receive, every=True)
 
     def _receive(self, topic: Topic[Message], payload: bytes) -> None:
         message, envelope = decode(payload, topic.message, topic.max_bytes)

@@ -164,7 +164,7 @@ DAMAGES: dict[str, Callable[[bytearray, int, int], bytearray]] = {
 }
 
 
-@settings(max_examples=250)
+@settings(max_examples=120)
 @given(
     name=st.sampled_from(FILES[:4]),
     damage=st.sampled_from(sorted(DAMAGES)),
@@ -194,7 +194,7 @@ def test_damage_to_one_file_gives_an_earlier_state_and_never_garbage(
     shutil.rmtree(folder)
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(
     places=st.lists(
         st.tuples(st.sampled_from(FILES), st.floats(0, 1, exclude_max=True)), min_size=2, max_size=8
@@ -217,6 +217,48 @@ def test_damage_all_over_never_gives_garbage(
     journal.close()
     assert _meaning(_recover(folder)[0]) == end - 1
     shutil.rmtree(folder)
+
+
+# --- death at each write ----------------------------------------------------------------------------------------
+
+
+def test_death_before_any_statement_loses_nothing_that_was_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The files as they are before each statement that SQLite is given, as a killed process would leave them."""
+    live, copies = tmp_path / "live", tmp_path / "copies"
+    acknowledged, checked = -1, 0
+    connect = Journal._connect
+
+    def check(statement: str) -> None:
+        nonlocal checked
+        if not statement.startswith(("BEGIN", "INSERT", "DELETE", "COMMIT", "CREATE", "PRAGMA user")):
+            return
+        checked += 1
+        folder = copies / str(checked)
+        shutil.copytree(live, folder)
+        with monkeypatch.context() as patch:
+            patch.setattr(Journal, "_connect", connect)
+            found = _recover(folder)
+        assert (_meaning(found[0]) if found else -1) == acknowledged, statement
+
+    def traced(journal: Journal, path: Path) -> sqlite3.Connection:
+        connection = connect(journal, path)
+        connection.set_trace_callback(check)
+        return connection
+
+    monkeypatch.setattr(Journal, "_connect", traced)
+    journal = Journal(live, "s")
+    journal.recover()
+    number = 1
+    for generation in range(4):
+        journal.begin(_state(number), generation)
+        acknowledged = number - 1
+        for _ in range(3):
+            journal.append(_record(number))
+            acknowledged, number = number, number + 1
+    journal.close()
+    assert checked > 40
 
 
 # --- kill -9 ----------------------------------------------------------------------------------------------------
