@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -293,24 +294,7 @@ class SimStage:
 
     def snapshot(self) -> bytes:
         """Robot, follower, judge, keyframes and counters; random streams need nothing but the tick."""
-        path = self._follower.path
-        return pack_snapshot(
-            {
-                "robot": list(self._robot.state),
-                "path": asdict(path) if path is not None else None,
-                "follower": asdict(self._follower.state),
-                "command": list(self._command),
-                "plan": list(self._plan),
-                "estimate": list(self._estimate),
-                "covered": np.packbits(self._judge.covered),
-                "keyframes": self._keyframes,
-                "clock": [self._tick, self._last_ns],
-                "distance_m": self._distance_m,
-                "flags": [self._blocked, self._ended, self._told_lost],
-                "slots": self._slots,
-                "bad_plans": self.bad_plans,
-            }
-        )
+        return pack_snapshot({**self._beside_judge(), "covered": np.packbits(self._judge.covered)})
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot of a stage with the same configuration and seed."""
@@ -318,6 +302,40 @@ class SimStage:
         cells = self._judge.spec.width * self._judge.spec.height
         covered = np.unpackbits(state["covered"], count=cells).astype(np.bool_)
         self._judge.set_covered(covered.reshape(self._judge.spec.shape))
+        self._set_beside_judge(state)
+
+    def journal(self, outputs: Outputs) -> bytes:
+        """All but the judge's cells, and of these the ones covered since the last record.
+
+        The world goes on from what was last judged or mapped (twice a second, and at each keyframe): the true robot
+        stands still from there on, and what was covered by the last report stays covered.
+        """
+        return pack_snapshot({**self._beside_judge(), "new": self._judge.take_news()})
+
+    def replay(self, record: bytes) -> None:
+        """Take in a record of the journal."""
+        state = unpack_snapshot(record)
+        self._judge.add_covered(state["new"])
+        self._set_beside_judge(state)
+
+    def _beside_judge(self) -> dict[str, Any]:
+        path = self._follower.path
+        return {
+            "robot": list(self._robot.state),
+            "path": asdict(path) if path is not None else None,
+            "follower": asdict(self._follower.state),
+            "command": list(self._command),
+            "plan": list(self._plan),
+            "estimate": list(self._estimate),
+            "keyframes": self._keyframes,
+            "clock": [self._tick, self._last_ns],
+            "distance_m": self._distance_m,
+            "flags": [self._blocked, self._ended, self._told_lost],
+            "slots": self._slots,
+            "bad_plans": self.bad_plans,
+        }
+
+    def _set_beside_judge(self, state: dict[str, Any]) -> None:
         self._robot.state = RobotState(*state["robot"])
         self._follower.set_path(TimedPath(**state["path"]) if state["path"] is not None else None)
         memory = state["follower"]
