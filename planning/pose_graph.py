@@ -1,7 +1,6 @@
 """Planar pose graphs: the poses that fit relative measurements best (Gauss-Newton on SE(2), sparse).
 
-After Kuemmerle et al., "g2o: A general framework for graph optimization" (ICRA 2011), with its error of an edge:
-z^-1 * (x_i^-1 * x_j). Levenberg's damping steps in only where a plain Gauss-Newton step would raise the cost.
+The error of an edge is that of Kuemmerle et al., "g2o" (ICRA 2011): z^-1 * (x_i^-1 * x_j).
 """
 
 from __future__ import annotations
@@ -10,11 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.linalg import splu
 
-_SMALLEST_DAMPING = 1e-6
-_LARGEST_DAMPING = 1e8
+from planning.gauss_newton import Linear, assemble, minimise
 
 
 class Edges(NamedTuple):
@@ -28,14 +24,6 @@ class Edges(NamedTuple):
     second: NDArray[np.int64]
     measured: NDArray[np.float64]
     information: NDArray[np.float64]
-
-
-class _Linear(NamedTuple):
-    """cost: half the weighted sum of squares. hessian, gradient: of the free unknowns."""
-
-    cost: float
-    hessian: csc_array
-    gradient: NDArray[np.float64]
 
 
 def wrap(angle_rad: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -76,65 +64,22 @@ def optimise(
 
     Ends when no pose moves by more than `tolerance` (m, rad). Raises ValueError when the edges leave a pose free.
     """
-    best = poses.astype(np.float64, copy=True)
-    if len(best) < 2 or not len(edges.first):
-        return best
-    damping, linear = 0.0, _linearise(best, edges)
-    for _ in range(max_iterations):
-        step = _solve(linear, damping)
-        moved = best.copy()
-        moved[1:] += step
+    if len(poses) < 2 or not len(edges.first):
+        return poses.astype(np.float64, copy=True)
+
+    def linearise(at: NDArray[np.float64]) -> Linear:
+        jacobians = _jacobians(at, edges)
+        ends = (edges.first, edges.second)
+        return assemble(len(at), ends, residuals(at, edges), edges.information, jacobians)
+
+    def retract(at: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        moved = at.copy()
+        moved[1:] += step.reshape(-1, 3)
         moved[:, 2] = wrap(moved[:, 2])
-        small = float(np.abs(step).max()) < tolerance
-        if small or cost(moved, edges) <= linear.cost:
-            best, damping = moved, damping / 10.0 if damping > _SMALLEST_DAMPING else 0.0
-            if small:
-                break
-            linear = _linearise(best, edges)
-        else:
-            damping = max(10.0 * damping, _SMALLEST_DAMPING)
-            if damping > _LARGEST_DAMPING:
-                break
-    return best
+        return moved
 
-
-def _solve(linear: _Linear, damping: float) -> NDArray[np.float64]:
-    """The step of the free poses, shape (n - 1, 3)."""
-    hessian = linear.hessian
-    if damping > 0.0:
-        hessian = csc_array(hessian + damping * diags_array(hessian.diagonal()))
-    try:
-        # A symmetric ordering without pivoting: as good as Cholesky here, and the fill stays small.
-        factor = splu(
-            hessian, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-    except RuntimeError as error:
-        raise ValueError(f"pose graph: no edges tie some poses to the first one ({error})") from error
-    step: NDArray[np.float64] = -factor.solve(linear.gradient)
-    return step.reshape(-1, 3)
-
-
-def _linearise(poses: NDArray[np.float64], edges: Edges) -> _Linear:
-    """Cost, Gauss-Newton Hessian and gradient over the poses but the first."""
-    e = residuals(poses, edges)
-    of_first, of_second = _jacobians(poses, edges)
-    weighted = np.einsum("mij,mj->mi", edges.information, e)
-    n = len(poses)
-    gradient = np.zeros((n, 3))
-    np.add.at(gradient, edges.first, np.einsum("mji,mj->mi", of_first, weighted))
-    np.add.at(gradient, edges.second, np.einsum("mji,mj->mi", of_second, weighted))
-    rows, columns, values = [], [], []
-    within = np.arange(3)
-    for a, of_a in ((edges.first, of_first), (edges.second, of_second)):
-        left = np.einsum("mji,mjk->mik", of_a, edges.information)
-        for b, of_b in ((edges.first, of_first), (edges.second, of_second)):
-            values.append(np.einsum("mik,mkj->mij", left, of_b).ravel())
-            rows.append(np.broadcast_to(3 * a[:, None, None] + within[:, None], (len(a), 3, 3)).ravel())
-            columns.append(np.broadcast_to(3 * b[:, None, None] + within, (len(a), 3, 3)).ravel())
-    whole = coo_array(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(3 * n, 3 * n)
-    )
-    return _Linear(0.5 * float(np.sum(e * weighted)), csc_array(whole.tocsc()[3:, 3:]), gradient[1:].ravel())
+    start = poses.astype(np.float64, copy=True)
+    return minimise(start, linearise, lambda at: cost(at, edges), retract, max_iterations, tolerance)
 
 
 def _jacobians(poses: NDArray[np.float64], edges: Edges) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
