@@ -16,13 +16,15 @@ from schemas.world import CoverageWindow
 
 _COLOURS = ["#ffffff", "#f5d6a8", "#a9d5b5", "#1f2933", "#9aa5b1"]
 _LABELS = ("", "ground, not covered", "covered", "obstacle", "free, out of reach")
+_GROUND, _COVERED, _OUT_OF_REACH = 1, 2, 4
 _LONGEST_IN = 12.0
 
 
 class Canvas:
     """The windows around the robot, laid over one another as they come: the newest word on each cell.
 
-    A cell that the newest window does not know keeps what was known of it before.
+    A cell that the newest window does not know keeps what was known of it before. So does ground that the newest
+    window calls out of reach: the way to it lies outside of that window.
     """
 
     def __init__(self) -> None:
@@ -38,7 +40,9 @@ class Canvas:
         common = overlap(self.spec, spec)
         assert common is not None  # the canvas has just grown over the window
         here, there = self.cell[common[0]], window.cell[common[1]]
-        self.cell[common[0]] = np.where(there == 0, here, there)
+        was_ground = (here == _GROUND) | (here == _COVERED)
+        keeps = (there == 0) | ((there == _OUT_OF_REACH) & was_ground)
+        self.cell[common[0]] = np.where(keeps, here, there)
 
     def _grow(self, spec: GridSpec) -> None:
         if self.spec is None:
@@ -75,6 +79,7 @@ def feed_picture(
     low, high = _bounds(canvas, driven)
     width, height = high[0] - low[0], high[1] - low[1]
     scale = _LONGEST_IN / max(width, height)
+    star = min(9.0, max(3.0, 360.0 / max(width, height)))
     figure = Figure(figsize=(max(5.0, width * scale), max(5.0, height * scale)), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -88,9 +93,9 @@ def feed_picture(
         )  # fmt: skip
     handles: list[object] = [Patch(color=c, label=n) for c, n in zip(_COLOURS, _LABELS, strict=True) if n]
     handles += axes.plot(driven[:, 0], driven[:, 1], color="#c2410c", linewidth=0.7, label="driven")
-    handles += axes.plot(*breadcrumbs.T, ".", color="#1d4ed8", markersize=4, label="breadcrumbs")
+    handles += axes.plot(*breadcrumbs.T, ".", color="#1d4ed8", markersize=star / 2.0, label="breadcrumbs")
     handles += axes.plot(
-        *frontiers.T, "*", color="#be185d", markersize=9, markeredgecolor="white", markeredgewidth=0.4,
+        *frontiers.T, "*", color="#be185d", markersize=star, markeredgecolor="white", markeredgewidth=0.4,
         label="frontiers",
     )  # fmt: skip
     axes.set_xlim(low[0], high[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -137,7 +138,7 @@ def _write(
         "duration_s": recording.end_ns / SECOND_NS,
         "breadcrumbs": len(crumbs),
         "frontiers": len(frontiers),
-        "given_up": len(last.unreachable_reason) if last else 0,
+        "given_up": dict(sorted(Counter(last.unreachable_reason).items())) if last else {},
         "reachable_area_m2": round(last.reachable_area_m2, 2) if last else 0.0,
         "covered_area_m2": round(last.covered_area_m2, 2) if last else 0.0,
         "coverage": last.covered_fraction if last else 0.0,

@@ -49,24 +49,35 @@ class FeedStage:
         found: Outputs = []
         moments = self._recording.moments
         while self._next < len(moments) and moments[self._next].stamp_ns <= now:
-            before = moments[self._next - 1] if self._next else None
-            found += self._play(moments[self._next], before, now)
+            found += self._play(moments[self._next], now)
             self._next += 1
         if self._next:
             found.insert(0, Output(ODOMETRY, _odometry(moments[self._next - 1], now)))
         return found
 
-    def _play(self, moment: Moment, before: Moment | None, now: Stamp) -> Outputs:
+    def _play(self, moment: Moment, now: Stamp) -> Outputs:
         found: Outputs = []
         if self._add_keyframe(moment):
             found.append(Output(POSE_GRAPH, self._pose_graph(now)))
         if moment.points_m is None:
-            came_from = moment if before is None or moment.jumped else before
-            found.append(Output(READY_GRID, driven_ground(came_from.odom, moment.odom, now)))
+            found.append(Output(READY_GRID, driven_ground(self._way_ahead(), now)))
         else:
             found.append(Output(CLOUD, self._cloud(moment, now)))
         found.append(Output(COVERAGE_SCAN, self._look(moment, now)))
         return found
+
+    def _way_ahead(self) -> list[Planar]:
+        """From here on, as far as the coverage sensor looks: ground that is going to be driven is free by now."""
+        moments = self._recording.moments
+        way: list[Planar] = []
+        left_m = self._sensor[0]
+        for moment in moments[self._next :]:
+            if way:
+                left_m -= math.dist(way[-1][:2], moment.odom[:2])
+                if moment.jumped or left_m < 0.0:
+                    break
+            way.append(moment.odom)
+        return way
 
     def _add_keyframe(self, moment: Moment) -> bool:
         due = moment.keyframe
@@ -147,20 +158,23 @@ class Onlooker:
         """Nothing."""
 
 
-def driven_ground(a: Planar, b: Planar, now: Stamp) -> ReadyGrid:
-    """What driving from a to b says of the ground: free within `CLEARANCE_M` of the way, nothing else known."""
-    low = [math.floor((min(p, q) - CLEARANCE_M) / _GRID_M) - 1 for p, q in zip(a[:2], b[:2], strict=True)]
-    high = [math.ceil((max(p, q) + CLEARANCE_M) / _GRID_M) + 1 for p, q in zip(a[:2], b[:2], strict=True)]
-    x = (np.arange(low[0], high[0]) + 0.5) * _GRID_M - a.x_m
-    y = (np.arange(low[1], high[1]) + 0.5)[:, None] * _GRID_M - a.y_m
-    dx, dy = b.x_m - a.x_m, b.y_m - a.y_m
-    along = np.clip((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-12), 0.0, 1.0)
-    free = np.hypot(x - along * dx, y - along * dy) <= CLEARANCE_M
+def driven_ground(way: list[Planar], now: Stamp) -> ReadyGrid:
+    """What driving along a way says of the ground: free within `CLEARANCE_M` of it, nothing else known."""
+    points = np.array([place[:2] for place in way])
+    low = np.floor((points.min(axis=0) - CLEARANCE_M) / _GRID_M).astype(int) - 1
+    high = np.ceil((points.max(axis=0) + CLEARANCE_M) / _GRID_M).astype(int) + 1
+    x = (np.arange(low[0], high[0]) + 0.5) * _GRID_M
+    y = (np.arange(low[1], high[1]) + 0.5)[:, None] * _GRID_M
+    free = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.bool_)
+    for a, b in zip(points, points[1:] if len(points) > 1 else points, strict=False):
+        dx, dy = b - a
+        along = np.clip(((x - a[0]) * dx + (y - a[1]) * dy) / max(dx * dx + dy * dy, 1e-12), 0.0, 1.0)
+        free |= np.hypot(x - a[0] - along * dx, y - a[1] - along * dy) <= CLEARANCE_M
     return ReadyGrid(
         stamp_ns=now,
         resolution_m=_GRID_M,
-        origin_x_m=low[0] * _GRID_M,
-        origin_y_m=low[1] * _GRID_M,
+        origin_x_m=float(low[0] * _GRID_M),
+        origin_y_m=float(low[1] * _GRID_M),
         height=free.shape[0],
         width=free.shape[1],
         occupancy=np.where(free, 0, -1).astype(np.int8),
