@@ -39,7 +39,8 @@ class _Runner:
 class Lockstep:
     """Runs stages under a virtual clock.
 
-    options: configuration by service. observer: called with every message when a stage has made it.
+    options: configuration by service. observer: called with every message when a stage has made it. extra: stages that
+    are given instead of made, by the service whose place they take (they write its topics).
     digest(): hash of every byte that was published, to compare runs.
     """
 
@@ -50,6 +51,7 @@ class Lockstep:
         robot: str = "robot",
         observer: Observer | None = None,
         stages: tuple[str, ...] = STAGES,
+        extra: Mapping[str, tuple[StageSpec, Stage]] | None = None,
     ) -> None:
         self.now: Stamp = 0
         self._observer = observer
@@ -57,8 +59,10 @@ class Lockstep:
         self._order = 0
         self._pending: list[tuple[Stamp, int, Topic[Message], bytes]] = []
         self._runners: dict[str, _Runner] = {}
-        for name in stages:
-            spec, stage = make_stage(name, options.get(name, {}), StageSetup(robot, seed))
+        given = dict(extra or {})
+        for name in (*stages, *(n for n in given if n not in stages)):
+            setup = StageSetup(robot, seed)
+            spec, stage = given[name] if name in given else make_stage(name, options.get(name, {}), setup)
             mailbox = Mailbox(robot, tuple(read_by(name)))
             outbox = Outbox(robot, name, 1)
             self._runners[name] = _Runner(spec, stage, mailbox, outbox, 0, frozenset(spec.triggers))
