@@ -1,0 +1,316 @@
+"""Which points are ground: along each bearing, outwards from the robot's feet; and the ground's height, fused."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.kernels import njit
+from services.riskmap.cells import CEILING_SEEN, HIT_WEIGHT, LOG_ODDS, MEAN, SEEN, TRAVELLED, VARIANCE
+from services.riskmap.sweep import BEARINGS, Sweep
+
+NOTHING, GROUND, ABOVE = 0, 1, 2
+"""Kinds of a polar bin: without points, its lowest point is ground, all its points stand above the ground."""
+
+_STEEP = 1.2
+"""Ground may rise by so much per metre (50 degrees) ..."""
+_STEEP_M = 0.7
+"""... over the first so many metres since what was last seen of the bearing, ..."""
+_GENTLE = 0.15
+"""... and by so much beyond them: where ground rises, rings lie close together, so a wide gap is level or falls."""
+_FOOT_M = 0.05
+"""The lowest point of something upright is its foot on the ground when it is so near to the ground before it, m."""
+_TRUSTED_POINTS = 4.0
+"""From so many points a cell's ground is the authority on what stands above it."""
+_CONTRADICTED_SIGMA_M = 0.05
+"""What a ray that passes below a cell's ground adds to the ground's deviation, m."""
+_FORGOTTEN_VARIANCE = 0.3**2
+"""Contradicted ground is forgotten when its variance is more, m2."""
+
+
+class GroundRules(NamedTuple):
+    """Numbers of the ground model; see the config. resolution_m, then the window's origin: global and in memory.
+
+    travelled_m: distance driven so far. feet_m: height of the ground at the robot.
+    """
+
+    resolution_m: float
+    ix0: int
+    iy0: int
+    row0: int
+    column0: int
+    travelled_m: float
+    feet_m: float
+    height_m: float
+    step_m: float
+    slope: float
+    range_sigma_m: float
+    angle_sigma_rad: float
+    drift_per_m: float
+    max_gap_m: float
+    fill_sigma_per_m: float
+    pass_log_odds: float
+    hit_log_odds: float
+
+
+@njit
+def slot(rules: GroundRules, height: int, width: int, x: float, y: float) -> tuple[int, int]:
+    """(row, column) in memory of the cell at a point, or (-1, -1) outside the window."""
+    row = math.floor(y / rules.resolution_m) - rules.iy0
+    column = math.floor(x / rules.resolution_m) - rules.ix0
+    if row < 0 or row >= height or column < 0 or column >= width:
+        return -1, -1
+    row += rules.row0
+    column += rules.column0
+    return (row - height if row >= height else row), (column - width if column >= width else column)
+
+
+@njit
+def variance_now(cell: NDArray[np.float32], rules: GroundRules) -> float:
+    """Variance of a known cell's height by now: odometry's height may have drifted since it was looked at, m2."""
+    drift = rules.drift_per_m * (rules.travelled_m - cell[TRAVELLED])
+    return cell[VARIANCE] + drift * drift
+
+
+@njit
+def has_body(sweep: Sweep, step_m: float, height_m: float) -> NDArray[np.bool_]:
+    """(BEARINGS, bins): whether a polar bin holds points between step and robot height over its lowest point."""
+    found = np.zeros(sweep.low.shape, dtype=np.bool_)
+    last = sweep.low.shape[1] - 1
+    for b in range(BEARINGS):
+        for i in range(sweep.start[b], sweep.start[b + 1]):
+            k = min(int(sweep.distance[i] / sweep.bin_m), last)
+            above = sweep.sensor[2] + sweep.points[i, 2] - sweep.low[b, k]
+            if step_m < above <= height_m:
+                found[b, k] = True
+    return found
+
+
+@njit
+def walk(
+    sweep: Sweep, body: NDArray[np.bool_], cells: NDArray[np.float32], rules: GroundRules
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Kind of each polar bin, and the height of the ground in it (or below it), both (BEARINGS, bins).
+
+    The lowest point of a bin is ground unless it rises too steeply from the last ground of its bearing, stands well
+    above the ground that the cell is known to have, or is the middle of something upright. Ground may fall as it
+    likes. So crowns, overhangs and decks above the robot are not ground, as long as ground below them leads there.
+    """
+    kind = np.zeros(sweep.low.shape, dtype=np.uint8)
+    ground = np.zeros(sweep.low.shape, dtype=np.float32)
+    for b in range(BEARINGS):
+        if sweep.start[b] == sweep.start[b + 1]:
+            continue
+        angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
+        dx, dy = math.cos(angle), math.sin(angle)
+        last_z, last_r = rules.feet_m, 0.0
+        for k in range(sweep.low.shape[1]):
+            z = sweep.low[b, k]
+            if z == np.inf:
+                continue
+            r = sweep.low_distance[b, k]
+            row, column = slot(rules, cells.shape[0], cells.shape[1], sweep.sensor[0] + r * dx, sweep.sensor[1] + r * dy)  # fmt: skip  # noqa: E501
+            known = False
+            if row >= 0:
+                cell = cells[row, column]
+                known = cell[SEEN] >= _TRUSTED_POINTS and cell[MEAN] > last_z - rules.height_m
+            gap = r - last_r
+            if known:
+                gate = max(rules.step_m, 3.0 * math.sqrt(variance_now(cell, rules)))
+                is_ground = z <= cell[MEAN] + gate
+            elif body[b, k]:
+                is_ground = z <= last_z + _FOOT_M + 0.1 * min(gap, 0.5)
+            else:
+                is_ground = z <= last_z + rules.step_m + _STEEP * min(gap, _STEEP_M) + _GENTLE * max(gap - _STEEP_M, 0.0)  # fmt: skip  # noqa: E501
+            last_r = r
+            if is_ground:
+                kind[b, k], ground[b, k] = GROUND, z
+                last_z = z
+            else:
+                kind[b, k] = ABOVE
+                ground[b, k] = min(cell[MEAN], z) if known else min(last_z, z)
+    return kind, ground
+
+
+@njit
+def fuse_ground(
+    sweep: Sweep,
+    kind: NDArray[np.uint8],
+    ground: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    rules: GroundRules,
+) -> None:
+    """Fuse the sweep's ground points into the cells: one Kalman update a cell and sweep.
+
+    A cell's measurement is the mean of its low points, those within a step of the lowest; its variance is that of the
+    sensor's attitude at this range, which all points of a sweep share, and of the points' scatter by their number.
+    """
+    height, width = cells.shape[0], cells.shape[1]
+    lowest = np.full((height, width), np.inf, dtype=np.float32)
+    sums = np.zeros((height, width, 4), dtype=np.float32)
+    count = sweep.points.shape[0]
+    rows, columns = np.full(count, -1, dtype=np.int32), np.zeros(count, dtype=np.int32)
+    touched = np.empty((count, 2), dtype=np.int32)
+    last = kind.shape[1] - 1
+    for b in range(BEARINGS):
+        for i in range(sweep.start[b], sweep.start[b + 1]):
+            k = min(int(sweep.distance[i] / sweep.bin_m), last)
+            z = np.float32(sweep.sensor[2] + sweep.points[i, 2])
+            if kind[b, k] != GROUND or z - ground[b, k] > rules.step_m:
+                continue
+            r, c = slot(rules, height, width, sweep.sensor[0] + sweep.points[i, 0], sweep.sensor[1] + sweep.points[i, 1])  # fmt: skip  # noqa: E501
+            rows[i], columns[i] = r, c
+            if r >= 0 and z < lowest[r, c]:
+                lowest[r, c] = z
+    found = 0
+    for i in range(count):
+        r, c = rows[i], columns[i]
+        if r < 0:
+            continue
+        over = np.float32(sweep.sensor[2] + sweep.points[i, 2]) - lowest[r, c]
+        if over <= rules.step_m:
+            if sums[r, c, 0] == 0.0:
+                touched[found, 0], touched[found, 1] = r, c
+                found += 1
+            sums[r, c, 0] += 1.0
+            sums[r, c, 1] += over
+            sums[r, c, 2] += over * over
+            sums[r, c, 3] = max(sums[r, c, 3], sweep.distance[i])
+    for t in range(found):
+        r, c = touched[t, 0], touched[t, 1]
+        n = sums[r, c, 0]
+        mean = sums[r, c, 1] / n
+        scatter = max(sums[r, c, 2] / n - mean * mean, 0.0)
+        attitude = rules.angle_sigma_rad * sums[r, c, 3]
+        noise = attitude * attitude + (rules.range_sigma_m * rules.range_sigma_m + scatter) / n
+        _fuse(cells[r, c], lowest[r, c] + mean, noise, n, rules)
+
+
+@njit
+def _fuse(cell: NDArray[np.float32], z: float, noise: float, points: float, rules: GroundRules) -> None:
+    """One measurement of a cell's ground: Kalman, unless it does not fit what was known; then the new one stands."""
+    if cell[SEEN] > 0.0:
+        prior = variance_now(cell, rules)
+        gate = max(rules.step_m, 3.0 * math.sqrt(prior + noise))
+        if abs(z - cell[MEAN]) <= gate:
+            gain = prior / (prior + noise)
+            z = cell[MEAN] + gain * (z - cell[MEAN])
+            noise = (1.0 - gain) * prior
+            points = min(points + cell[SEEN], 1e6)
+        elif abs(z - cell[MEAN]) > rules.height_m:
+            cell[CEILING_SEEN] = 0.0  # another storey
+    cell[MEAN], cell[VARIANCE] = z, noise
+    cell[SEEN], cell[TRAVELLED] = points, rules.travelled_m
+    if cell[HIT_WEIGHT] == 0.0:
+        cell[LOG_ODDS] = max(cell[LOG_ODDS] - rules.pass_log_odds, -rules.hit_log_odds)
+
+
+@njit
+def suppose(cell: NDArray[np.float32], z: float, variance: float, rules: GroundRules) -> None:
+    """A height that was not measured: taken where nothing is known, or only something less certain."""
+    if cell[VARIANCE] == 0.0 or (cell[SEEN] == 0.0 and variance < variance_now(cell, rules)):
+        cell[MEAN], cell[VARIANCE] = z, variance
+        cell[SEEN], cell[TRAVELLED] = 0.0, rules.travelled_m
+
+
+@njit
+def join_rings(
+    sweep: Sweep,
+    kind: NDArray[np.uint8],
+    ground: NDArray[np.float32],
+    cells: NDArray[np.float32],
+    rules: GroundRules,
+) -> None:
+    """Between two consecutive ground hits of a bearing: fill the ground in, or forget what the ray shows to be wrong.
+
+    The gap is filled when it is short and slopes as the robot could drive, and is either nearly level or slopes as the
+    ground before or after it does: a ledge or the rim of a pit does neither.
+    """
+    bins = kind.shape[1]
+    distance, height = np.empty(bins + 1, dtype=np.float64), np.empty(bins + 1, dtype=np.float64)
+    clear = np.empty(bins + 1, dtype=np.bool_)
+    for b in range(BEARINGS):
+        if sweep.start[b] == sweep.start[b + 1]:
+            continue
+        distance[0], height[0], clear[0] = 0.0, rules.feet_m, False
+        count, obstructed = 1, False
+        for k in range(bins):
+            if kind[b, k] == GROUND:
+                distance[count], height[count] = sweep.low_distance[b, k], ground[b, k]
+                clear[count] = not obstructed
+                count += 1
+                obstructed = False
+            elif kind[b, k] == ABOVE:
+                obstructed = True
+        angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
+        dx, dy = math.cos(angle), math.sin(angle)
+        for j in range(1, count):
+            fill = j > 1 and clear[j] and _joinable(distance, height, clear, count, j, rules)
+            _along_gap(sweep, dx, dy, distance[j - 1], height[j - 1], distance[j], height[j], fill, cells, rules)
+
+
+@njit
+def _joinable(
+    distance: NDArray[np.float64],
+    height: NDArray[np.float64],
+    clear: NDArray[np.bool_],
+    count: int,
+    j: int,
+    rules: GroundRules,
+) -> bool:
+    """Whether ground may be supposed between the hits j - 1 and j of a bearing."""
+    gap, rise = distance[j] - distance[j - 1], height[j] - height[j - 1]
+    if gap > rules.max_gap_m or abs(rise) > rules.slope * gap + 0.01:
+        return False
+    if abs(rise) <= 0.5 * rules.step_m:
+        return True
+    for k in (j - 1, j + 1):
+        if 1 < k < count and clear[k]:
+            other = (height[k] - height[k - 1]) / max(distance[k] - distance[k - 1], 0.05)
+            if abs(other - rise / gap) <= _GENTLE:
+                return True
+    return False
+
+
+@njit
+def _along_gap(
+    sweep: Sweep,
+    dx: float,
+    dy: float,
+    near: float,
+    near_z: float,
+    far: float,
+    far_z: float,
+    fill: bool,
+    cells: NDArray[np.float32],
+    rules: GroundRules,
+) -> None:
+    """The cells strictly between two hits: suppose ground, and doubt ground that stands in the ray's way."""
+    pace = 0.7 * rules.resolution_m
+    fall = (far_z - sweep.sensor[2]) / far
+    for s in range(1, math.ceil((far - near) / pace)):
+        r = near + s * pace
+        row, column = slot(rules, cells.shape[0], cells.shape[1], sweep.sensor[0] + r * dx, sweep.sensor[1] + r * dy)  # fmt: skip  # noqa: E501
+        if row < 0:
+            return
+        cell = cells[row, column]
+        if cell[VARIANCE] > 0.0 and far - r > rules.resolution_m:
+            tolerance = 0.05 + 3.0 * rules.angle_sigma_rad * r
+            if cell[MEAN] > sweep.sensor[2] + fall * r + tolerance:
+                _doubt(cell)
+        if fill:
+            share = (r - near) / (far - near)
+            sigma = rules.fill_sigma_per_m * min(r - near, far - r) + rules.range_sigma_m
+            suppose(cell, near_z + share * (far_z - near_z), sigma * sigma, rules)
+
+
+@njit
+def _doubt(cell: NDArray[np.float32]) -> None:
+    """A ray passed below this cell's ground: it is forgotten at once if it was supposed, else after a few rays."""
+    cell[VARIANCE] += _CONTRADICTED_SIGMA_M * _CONTRADICTED_SIGMA_M
+    if cell[SEEN] == 0.0 or cell[VARIANCE] > _FORGOTTEN_VARIANCE:
+        cell[VARIANCE] = 0.0
+        cell[SEEN] = 0.0
