@@ -9,7 +9,11 @@ MEAN: Final = 0
 VARIANCE: Final = 1
 """Of the ground's height when it was last looked at, m2; 0: nothing is known of the ground."""
 SEEN: Final = 2
-"""Points of ground that are in the mean; 0: the height is only supposed (interpolated, driven on, or at the start)."""
+"""Points of ground that are in the mean; 0: the height is only supposed (interpolated, driven on, or at the start).
+
+BELOW, with a variance of 0: no ground is known, but rays went over the cell that bound it from above; MEAN is the bound.
+"""
+BELOW: Final = -1.0
 TRAVELLED: Final = 3
 """Distance that the robot had driven when the ground was last looked at, m: since then odometry's height drifts."""
 LOG_ODDS: Final = 4

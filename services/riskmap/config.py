@@ -65,7 +65,7 @@ class Config(BaseModel):
     max_step_m: float = Field(
         SPOT.max_step_m, gt=0.02, le=1, description="A higher step is lethal, and points above it are obstacles, m."
     )
-    max_drop_m: float = Field(SPOT.max_step_m, gt=0.02, le=2, description="A deeper drop behind an edge is lethal, m.")
+    max_drop_m: float = Field(SPOT.max_drop_m, gt=0.02, le=2, description="A deeper drop behind an edge is lethal, m.")
     max_roughness_m: float = Field(
         _BELLY_SHARE * SPOT.belly_m, gt=0.01, le=1, description="Rms over the plane under the disc; more is lethal, m."
     )
@@ -104,10 +104,10 @@ class Config(BaseModel):
             "body_width_m": profile.width_m,
             "max_slope_rad": profile.max_slope_rad,
             "max_step_m": profile.max_step_m,
+            "max_drop_m": profile.max_drop_m,
             "max_roughness_m": _BELLY_SHARE * profile.belly_m,
         }
-        filled = {**own, **data}
-        return {"max_drop_m": filled["max_step_m"], **filled}
+        return {**own, **data}
 
     @property
     def alpha(self) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.kernels import njit
-from services.riskmap.cells import CEILING_SEEN, HIT_WEIGHT, LOG_ODDS, MEAN, SEEN, TRAVELLED, VARIANCE
+from services.riskmap.cells import BELOW, CEILING_SEEN, HIT_WEIGHT, LOG_ODDS, MEAN, SEEN, TRAVELLED, VARIANCE
 from services.riskmap.sweep import BEARINGS, Sweep
 
 NOTHING, GROUND, ABOVE = 0, 1, 2
@@ -29,6 +29,11 @@ _CONTRADICTED_SIGMA_M = 0.05
 """What a ray that passes below a cell's ground adds to the ground's deviation, m."""
 _FORGOTTEN_VARIANCE = 0.3**2
 """Contradicted ground is forgotten when its variance is more, m2."""
+
+_BOUND_TOLERANCE_M = 0.05
+"""Rays pass so much below supposed ground before it is taken for wrong, m."""
+_STEEP_LOOK = 0.1
+"""Rays that fall by less per metre bound no ground: they are far away, and pass over everything."""
 
 
 class GroundRules(NamedTuple):
@@ -59,8 +64,14 @@ class GroundRules(NamedTuple):
 @njit
 def slot(rules: GroundRules, height: int, width: int, x: float, y: float) -> tuple[int, int]:
     """(row, column) in memory of the cell at a point, or (-1, -1) outside the window."""
-    row = math.floor(y / rules.resolution_m) - rules.iy0
-    column = math.floor(x / rules.resolution_m) - rules.ix0
+    ix, iy = math.floor(x / rules.resolution_m), math.floor(y / rules.resolution_m)
+    return slot_of(rules, height, width, ix, iy)
+
+
+@njit
+def slot_of(rules: GroundRules, height: int, width: int, ix: int, iy: int) -> tuple[int, int]:
+    """(row, column) in memory of the cell of a global index, or (-1, -1) outside the window."""
+    row, column = iy - rules.iy0, ix - rules.ix0
     if row < 0 or row >= height or column < 0 or column >= width:
         return -1, -1
     row += rules.row0
@@ -210,7 +221,12 @@ def _fuse(cell: NDArray[np.float32], z: float, noise: float, points: float, rule
 
 @njit
 def suppose(cell: NDArray[np.float32], z: float, variance: float, rules: GroundRules) -> None:
-    """A height that was not measured: taken where nothing is known, or only something less certain."""
+    """A height that was not measured: taken where nothing is known, or only something less certain.
+
+    Not where rays have shown the ground to be lower.
+    """
+    if cell[SEEN] == BELOW and z > cell[MEAN] + _BOUND_TOLERANCE_M:
+        return
     if cell[VARIANCE] == 0.0 or (cell[SEEN] == 0.0 and variance < variance_now(cell, rules)):
         cell[MEAN], cell[VARIANCE] = z, variance
         cell[SEEN], cell[TRAVELLED] = 0.0, rules.travelled_m
@@ -297,10 +313,13 @@ def _along_gap(
         if row < 0:
             return
         cell = cells[row, column]
-        if cell[VARIANCE] > 0.0 and far - r > rules.resolution_m:
-            tolerance = 0.05 + 3.0 * rules.angle_sigma_rad * r
-            if cell[MEAN] > sweep.sensor[2] + fall * r + tolerance:
-                _doubt(cell)
+        if far - r > rules.resolution_m:
+            below = sweep.sensor[2] + fall * r + _BOUND_TOLERANCE_M + 3.0 * rules.angle_sigma_rad * r
+            if cell[VARIANCE] > 0.0:
+                if cell[MEAN] > below:
+                    _doubt(cell)
+            elif fall < -_STEEP_LOOK and not fill and (cell[SEEN] != BELOW or below < cell[MEAN]):
+                cell[MEAN], cell[SEEN] = below, BELOW
         if fill:
             share = (r - near) / (far - near)
             sigma = rules.fill_sigma_per_m * min(r - near, far - r) + rules.range_sigma_m

@@ -38,31 +38,45 @@ class TerrainMetrics(NamedTuple):
     drop_variance: NDArray[np.float32]
 
 
+class Ground(NamedTuple):
+    """The ground as the metrics see it, (h, w) each.
+
+    variance of the height without odometry's drift; single, the part of it that a cell does not share with its
+    neighbours; drift_m, the deviation of odometry's height since the cell was looked at (what neighbours of one age
+    have in common). bounded: not known, but not higher than height_m.
+    """
+
+    height_m: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    single: NDArray[np.float32]
+    drift_m: NDArray[np.float32]
+    known: NDArray[np.bool_]
+    bounded: NDArray[np.bool_]
+
+
 def terrain_metrics(
-    height_m: NDArray[np.float32],
-    variance: NDArray[np.float32],
-    known: NDArray[np.bool_],
+    ground: Ground,
     resolution_m: float,
     radius_m: float,
     max_slope: float,
     step_reach_m: float,
     drop_reach_m: float,
 ) -> TerrainMetrics:
-    """The metrics of a height field, all (h, w).
+    """The metrics of a height field.
 
     radius_m: the robot's disc. max_slope: rise per metre that counts as slope, not as a step. step_reach_m: a step is a
     difference over this distance or less. drop_reach_m: how far behind an edge lower ground is looked for.
     """
-    shape = height_m.shape
+    shape = ground.known.shape
     fitted = np.zeros(shape, dtype=np.bool_)
     layers = np.zeros((8, *shape), dtype=np.float32)
     disc_m = max(radius_m, 1.5 * resolution_m)
     spans = _disc_spans(disc_m / resolution_m)
-    _fit_planes(height_m, variance, known, resolution_m, disc_m, spans, fitted, layers[:4])
+    _fit_planes(ground.height_m, ground.variance, ground.known, resolution_m, disc_m, spans, fitted, layers[:4])
     reach = max(1, int(step_reach_m / resolution_m + 1e-6))
-    _find_steps(height_m, variance, known, resolution_m, reach, max_slope, layers[4], layers[5])
+    _find_steps(*ground[:1], *ground[2:5], resolution_m, reach, max_slope, layers[4], layers[5])
     reach = max(2, math.ceil(drop_reach_m / resolution_m))
-    _find_drops(height_m, variance, known, resolution_m, reach, max_slope, layers[6], layers[7])
+    _find_drops(*ground[:1], *ground[2:], resolution_m, reach, max_slope, layers[6], layers[7])
     return TerrainMetrics(fitted, *layers)
 
 
@@ -189,7 +203,8 @@ def _outer_rise(
 @njit
 def _find_steps(
     height_m: NDArray[np.float32],
-    variance: NDArray[np.float32],
+    single: NDArray[np.float32],
+    drift_m: NDArray[np.float32],
     known: NDArray[np.bool_],
     resolution_m: float,
     reach: int,
@@ -217,7 +232,7 @@ def _find_steps(
                         continue
                     rise = float(height_m[r1, c1]) - float(height_m[r, c])
                     rise -= _outer_rise(height_m, known, r, c, n * dr, n * dc, rise, max_slope * n * length)
-                    doubt = variance[r, c] + variance[r1, c1]
+                    doubt = single[r, c] + single[r1, c1] + (drift_m[r, c] - drift_m[r1, c1]) ** 2
                     low, high = (0, 1) if n == 1 else (1, n - 1)
                     for k in range(low, high + 1):
                         rk, ck = r + k * dr, c + k * dc
@@ -228,32 +243,61 @@ def _find_steps(
 @njit
 def _find_drops(
     height_m: NDArray[np.float32],
-    variance: NDArray[np.float32],
+    single: NDArray[np.float32],
+    drift_m: NDArray[np.float32],
     known: NDArray[np.bool_],
+    bounded: NDArray[np.bool_],
     resolution_m: float,
     reach: int,
     max_slope: float,
     drop: NDArray[np.float32],
     drop_variance: NDArray[np.float32],
 ) -> None:
-    """At cells next to unknown ones: how much lower the first ground behind them is than a slope would lead down to."""
-    for r in range(known.shape[0]):
-        for c in range(known.shape[1]):
+    """At cells next to unknown ones: how much lower than their slope would lead to the ground behind is.
+
+    Behind: the first known cell, or before it a cell whose ground rays have shown to lie below some height. What slope
+    explains is the fall before the edge and, where it is known, after the gap, whichever is less: the ray that sees
+    over an edge always falls gently, so that the mean slope over the gap says nothing.
+    """
+    rows, columns = known.shape
+    for r in range(rows):
+        for c in range(columns):
             if not known[r, c]:
                 continue
             for dr in range(-1, 2):
                 for dc in range(-1, 2):
-                    if (dr == 0 and dc == 0) or _known_at(known, r + dr, c + dc):
+                    r1, c1 = r + dr, c + dc
+                    if (dr == 0 and dc == 0) or not (0 <= r1 < rows and 0 <= c1 < columns) or known[r1, c1]:
                         continue
                     length = resolution_m * math.sqrt(float(dr * dr + dc * dc))
-                    for n in range(2, reach + 1):
-                        if not _known_at(known, r + n * dr, c + n * dc):
-                            continue
+                    before = _rise_per_m(height_m, known, r, c, -dr, -dc, length)
+                    for n in range(1, reach + 1):
                         r1, c1 = r + n * dr, c + n * dc
-                        fall = float(height_m[r, c]) - float(height_m[r1, c1]) - max_slope * n * length
+                        if not (0 <= r1 < rows and 0 <= c1 < columns):
+                            break
+                        slope, here = min(max(before, 0.0), max_slope), known[r1, c1]
+                        if here:
+                            after = -_rise_per_m(height_m, known, r1, c1, dr, dc, length)
+                            slope = min(slope, max(after, 0.0))
+                        elif not bounded[r1, c1]:
+                            continue
+                        fall = float(height_m[r, c]) - float(height_m[r1, c1]) - slope * n * length
                         if fall > drop[r, c]:
-                            drop[r, c], drop_variance[r, c] = fall, variance[r, c] + variance[r1, c1]
-                        break
+                            drop[r, c] = fall
+                            drop_variance[r, c] = single[r, c] + single[r1, c1] + (drift_m[r, c] - drift_m[r1, c1]) ** 2
+                        if here:
+                            break
+
+
+@njit
+def _rise_per_m(
+    height_m: NDArray[np.float32], known: NDArray[np.bool_], r: int, c: int, dr: int, dc: int, length: float
+) -> float:
+    """Rise per metre from a known cell over up to three more in a direction; 0 where the next is unknown."""
+    n = 0
+    while n < 3 and _known_at(known, r + (n + 1) * dr, c + (n + 1) * dc):
+        n += 1
+    return (float(height_m[r + n * dr, c + n * dc]) - float(height_m[r, c])) / (n * length) if n > 0 else 0.0
 
 
 @njit

@@ -12,6 +12,7 @@ from planning.grid import GridSpec
 from schemas.base import Pose
 from schemas.sensing import PointCloud, ReadyGrid
 from services.riskmap.cells import (
+    BELOW,
     CEILING,
     CEILING_SEEN,
     CHANNELS,
@@ -20,6 +21,7 @@ from services.riskmap.cells import (
     HIT_Y,
     LOG_ODDS,
     MEAN,
+    SEEN,
     TRAVELLED,
     VARIANCE,
 )
@@ -31,9 +33,12 @@ from services.riskmap.hazard import Limits, Obstacles, hazard_layers
 from services.riskmap.obstacles import add_hits, clear_pierced
 from services.riskmap.ready_grid import grid_evidence
 from services.riskmap.ring import RingWindow
-from services.riskmap.standing import stand_here, start_reach, suppose_start
+from services.riskmap.standing import stand_here, start_ground, suppose_start
 from services.riskmap.sweep import Sweep, read_sweep
-from services.riskmap.terrain import TerrainMetrics, close_holes, spread_heights, terrain_metrics
+from services.riskmap.terrain import Ground, TerrainMetrics, close_holes, spread_heights, terrain_metrics
+
+_SHARED = 0.1
+"""Share of a supposed height's variance that it does not have in common with its neighbours: they were supposed together."""
 
 
 class TerrainModel:
@@ -98,13 +103,8 @@ class TerrainModel:
         )  # fmt: skip
 
     def _stand(self, base: NDArray[np.float64], rules: GroundRules) -> None:
-        """The ground under the body: its plane is the robot's own, unless it has fallen over."""
-        up = base[:3, 2]
-        slopes = (-up[0] / up[2], -up[1] / up[2]) if up[2] > 0.5 else (0.0, 0.0)
-        c = self._config
-        stand_here(
-            base[0, 3], base[1, 3], c.footprint_radius_m, *slopes, c.stand_sigma_m, self._window.cells, rules
-        )
+        sigma_m, radius_m = self._config.stand_sigma_m, self._config.footprint_radius_m
+        stand_here(base[0, 3], base[1, 3], radius_m, *_body_slope(base), sigma_m, self._window.cells, rules)
 
     def _suppose_start(
         self,
@@ -114,9 +114,9 @@ class TerrainModel:
         base: NDArray[np.float64],
         rules: GroundRules,
     ) -> None:
-        reach_m = start_reach(sweep, kind, ground, self._config.start_radius_m, rules)
-        sigma_m = self._config.start_sigma_m
-        suppose_start(base[0, 3], base[1, 3], reach_m, sigma_m, self._window.cells, rules)
+        radius_m, sigma_m = self._config.start_radius_m, self._config.start_sigma_m
+        reach_m, slope = start_ground(sweep, kind, ground, radius_m, *_body_slope(base), rules)
+        suppose_start(base[0, 3], base[1, 3], reach_m, slope, sigma_m, self._window.cells, rules)
 
     def apply_grid(self, grid: ReadyGrid, robot: Pose, only_new: bool) -> None:
         """Take over a ready grid: obstacles where it is occupied, supposed ground at the robot's feet where free."""
@@ -159,20 +159,23 @@ class TerrainModel:
         c, res = self._config, self._window.spec.resolution_m
         height_m = cells[MEAN].copy()
         ground = cells[VARIANCE] > 0.0
-        drift = c.height_drift_per_m * (self._travelled_m - cells[TRAVELLED])
-        variance = np.where(ground, cells[VARIANCE] + drift * drift, 0.0).astype(np.float32)
+        drift_m = np.where(ground, c.height_drift_per_m * (self._travelled_m - cells[TRAVELLED]), 0.0)
+        drift_m = drift_m.astype(np.float32)
+        variance = np.where(ground, cells[VARIANCE], 0.0).astype(np.float32)
+        single = np.where(cells[SEEN] > 0.0, variance, np.float32(_SHARED) * variance)
         blocked = cells[LOG_ODDS] > 0.0
         known = ground & ~blocked  # what lies at the foot of an obstacle is no ground to drive on
+        bounded = (cells[SEEN] == BELOW) & ~ground
         close_holes(height_m, variance, known, blocked, c.max_step_m, c.fill_sigma_per_m * res)
         covered = (cells[CEILING_SEEN] > 0.0) & ground
         room = np.where(covered, cells[CEILING] - cells[MEAN], np.inf).astype(np.float32)
-        room_variance = np.where(covered, variance + c.range_sigma_m**2, 0.0).astype(np.float32)
+        room_variance = np.where(covered, variance + drift_m**2 + c.range_sigma_m**2, 0.0).astype(np.float32)
         hit = blocked & (cells[HIT_WEIGHT] > 0.0)
         offsets = (np.where(hit, cells[k], 0.0).astype(np.float32) for k in (HIT_X, HIT_Y))
         obstacles = Obstacles(cells[LOG_ODDS], *offsets, room, room_variance)
         metrics = terrain_metrics(
-            height_m, variance, known, res, c.footprint_radius_m, math.tan(c.max_slope_rad), c.step_reach_m,
-            c.drop_reach_m,
+            Ground(height_m, variance, single, drift_m, known, bounded & ~known), res, c.footprint_radius_m,
+            math.tan(c.max_slope_rad), c.step_reach_m, c.drop_reach_m,
         )  # fmt: skip
         return obstacles, height_m, metrics
 
@@ -192,3 +195,9 @@ class TerrainModel:
         self._travelled_m = float(state["travelled_m"])
         self._last_xyz = list(state["last_xyz"])
         self._feet_m = float(state["feet_m"])
+
+
+def _body_slope(base: NDArray[np.float64]) -> tuple[float, float]:
+    """Rise per metre along x and y of the plane that the robot stands on; none if it has fallen over."""
+    up = base[:3, 2]
+    return (float(-up[0] / up[2]), float(-up[1] / up[2])) if up[2] > 0.5 else (0.0, 0.0)
