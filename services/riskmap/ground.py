@@ -12,8 +12,8 @@ from planning.kernels import njit
 from services.riskmap.cells import BELOW, CEILING_SEEN, HIT_WEIGHT, LOG_ODDS, MEAN, SEEN, TRAVELLED, VARIANCE
 from services.riskmap.sweep import BEARINGS, Sweep
 
-NOTHING, GROUND, ABOVE = 0, 1, 2
-"""Kinds of a polar bin: without points, its lowest point is ground, all its points stand above the ground."""
+NOTHING, GROUND, ABOVE, OVERHEAD = 0, 1, 2, 3
+"""Kinds of a polar bin: without points; its lowest point is ground, above the ground, or above the robot."""
 
 _STEEP = 1.2
 """Ground may rise by so much per metre (50 degrees) ..."""
@@ -87,16 +87,22 @@ def variance_now(cell: NDArray[np.float32], rules: GroundRules) -> float:
 
 
 @njit
-def has_body(sweep: Sweep, step_m: float, height_m: float) -> NDArray[np.bool_]:
-    """(BEARINGS, bins): whether a polar bin holds points between step and robot height over its lowest point."""
-    found = np.zeros(sweep.low.shape, dtype=np.bool_)
-    last = sweep.low.shape[1] - 1
+def upright(sweep: Sweep, step_m: float, height_m: float) -> NDArray[np.bool_]:
+    """(BEARINGS, bins): whether there are points between step and robot height over a polar bin's lowest point.
+
+    In it or in the four next to it: the rays that meet a wall one above the other may fall into two bins.
+    """
+    low = sweep.low
+    found = np.zeros(low.shape, dtype=np.bool_)
+    last = low.shape[1] - 1
     for b in range(BEARINGS):
         for i in range(sweep.start[b], sweep.start[b + 1]):
             k = min(int(sweep.distance[i] / sweep.bin_m), last)
-            above = sweep.sensor[2] + sweep.points[i, 2] - sweep.low[b, k]
-            if step_m < above <= height_m:
-                found[b, k] = True
+            z = sweep.sensor[2] + sweep.points[i, 2]
+            for db, dk in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)):
+                bn, kn = (b + db) % BEARINGS, min(max(k + dk, 0), last)
+                if step_m < z - low[bn, kn] <= height_m:
+                    found[bn, kn] = True
     return found
 
 
@@ -136,13 +142,14 @@ def walk(
                 is_ground = z <= last_z + _FOOT_M + 0.1 * min(gap, 0.5)
             else:
                 is_ground = z <= last_z + rules.step_m + _STEEP * min(gap, _STEEP_M) + _GENTLE * max(gap - _STEEP_M, 0.0)  # fmt: skip  # noqa: E501
-            last_r = r
             if is_ground:
                 kind[b, k], ground[b, k] = GROUND, z
-                last_z = z
-            else:
-                kind[b, k] = ABOVE
-                ground[b, k] = min(cell[MEAN], z) if known else min(last_z, z)
+                last_z, last_r = z, r
+                continue
+            ground[b, k] = min(cell[MEAN], z) if known else min(last_z, z)
+            kind[b, k] = ABOVE if z - ground[b, k] <= rules.height_m else OVERHEAD
+            if kind[b, k] == ABOVE:
+                last_r = r
     return kind, ground
 
 

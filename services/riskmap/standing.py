@@ -15,6 +15,8 @@ from services.riskmap.sweep import BEARINGS, Sweep
 
 _NEIGHBOURS = 5
 """Rays of one azimuth may lie in several bins, and some are lost: a bearing is read with so many bins on either side."""
+_LIKE_OWN_SLOPE = 0.2
+"""The first ground seen may rise or fall, from the robot's own plane, by so much per metre."""
 _UNSEEN_START_M = 1.0
 """Where no bearing is near, or the first ground on it does not fit, so much is supposed around the start, m."""
 
@@ -52,13 +54,41 @@ def start_ground(
     radius_m: float,
     slope_x: float,
     slope_y: float,
+    feet_m: float,
     rules: GroundRules,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(BEARINGS,) each: how far ground around the start may be supposed, m, and its rise per metre.
 
-    Up to the first obstacle of the bearing, in the robot's own plane; else up to `radius_m`, straight from its feet to
-    the first ground seen. Where that is not to be reached by a slope that the robot can drive, less.
+    Straight from the robot's feet to the first ground seen: up to `radius_m`, or to that ground if it is not much
+    farther away, or to the first obstacle. Where the first ground does not lie about in the robot's own plane, or none
+    is seen, less; there and up to obstacles the slope is that of the bearings to the left and the right, or the
+    robot's own where there are none. feet_m: the robot's plane below the sensor.
     """
+    stop, first, rise = _first_seen(sweep, kind, ground, feet_m)
+    reach, slope = np.full(BEARINGS, min(radius_m, _UNSEEN_START_M)), np.full(BEARINGS, np.nan)
+    for b in range(BEARINGS):
+        angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
+        own = slope_x * math.cos(angle) + slope_y * math.sin(angle)
+        nearest_stop, nearest = np.inf, b
+        for away in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
+            other = (b + away) % BEARINGS
+            nearest_stop = min(nearest_stop, stop[other])
+            if first[other] < np.inf and (first[nearest] == np.inf or abs(rise[other] - own) < abs(rise[nearest] - own)):
+                nearest = other
+        if nearest_stop < min(first[nearest], radius_m):
+            reach[b] = nearest_stop
+        elif first[nearest] < np.inf and abs(rise[nearest] - own) <= _LIKE_OWN_SLOPE:
+            seen_m = first[nearest] if first[nearest] <= radius_m + rules.max_gap_m else 0.0
+            reach[b], slope[b] = min(max(radius_m, seen_m), nearest_stop), rise[nearest]
+    _between(slope, slope_x, slope_y)
+    return reach, slope
+
+
+@njit
+def _first_seen(
+    sweep: Sweep, kind: NDArray[np.uint8], ground: NDArray[np.float32], feet_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Of each bearing: range of the first obstacle, of the first ground (inf: none), and its rise from the feet."""
     stop, first, rise = np.full(BEARINGS, np.inf), np.full(BEARINGS, np.inf), np.zeros(BEARINGS)
     for b in range(BEARINGS):
         for k in range(kind.shape[1]):
@@ -67,28 +97,32 @@ def start_ground(
                 break
             if kind[b, k] == GROUND and first[b] == np.inf:
                 first[b] = sweep.low_distance[b, k]
-                rise[b] = (ground[b, k] - rules.feet_m) / first[b]
-    reach, slope = np.full(BEARINGS, min(radius_m, _UNSEEN_START_M)), np.zeros(BEARINGS)
+                rise[b] = (ground[b, k] - feet_m) / first[b]
+    return stop, first, rise
+
+
+@njit
+def _between(slope: NDArray[np.float64], slope_x: float, slope_y: float) -> None:
+    """Fill what is NaN, in place: linear in the angle between the nearest bearings on both sides."""
+    known = np.flatnonzero(np.isfinite(slope))
     for b in range(BEARINGS):
-        angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
-        slope[b] = slope_x * math.cos(angle) + slope_y * math.sin(angle)
-        nearest_stop, nearest = np.inf, b
-        for away in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
-            other = (b + away) % BEARINGS
-            nearest_stop = min(nearest_stop, stop[other])
-            if first[other] < first[nearest]:
-                nearest = other
-        if nearest_stop < min(first[nearest], radius_m):
-            reach[b] = nearest_stop
-        elif first[nearest] < np.inf and abs(rise[nearest]) <= rules.slope:
-            reach[b], slope[b] = min(radius_m, nearest_stop), rise[nearest]
-    return reach, slope
+        if math.isfinite(slope[b]):
+            continue
+        if known.size == 0:
+            angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
+            slope[b] = slope_x * math.cos(angle) + slope_y * math.sin(angle)
+            continue
+        i = np.searchsorted(known, b)
+        left, right = known[(i - 1) % known.size], known[i % known.size]
+        to_left, to_right = (b - left) % BEARINGS, (right - b) % BEARINGS
+        slope[b] = (slope[left] * to_right + slope[right] * to_left) / max(to_left + to_right, 1)
 
 
 @njit
 def suppose_start(
     x: float,
     y: float,
+    feet_m: float,
     reach_m: NDArray[np.float64],
     slope: NDArray[np.float64],
     sigma_m: float,
@@ -104,4 +138,4 @@ def suppose_start(
             bearing = int((math.atan2(dy, dx) / (2.0 * math.pi) + 1.0) * BEARINGS) % BEARINGS
             row, column = slot_of(rules, cells.shape[0], cells.shape[1], ix, iy)
             if away <= reach_m[bearing] - 0.5 * res and row >= 0 and cells[row, column, LOG_ODDS] <= 0.0:
-                suppose(cells[row, column], rules.feet_m + slope[bearing] * away, sigma_m * sigma_m, rules)
+                suppose(cells[row, column], feet_m + slope[bearing] * away, sigma_m * sigma_m, rules)

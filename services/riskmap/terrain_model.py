@@ -28,7 +28,7 @@ from services.riskmap.cells import (
 from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
 from services.riskmap.extrinsics import base_in_odom, body_box, transform, without_body
-from services.riskmap.ground import GroundRules, fuse_ground, has_body, join_rings, walk
+from services.riskmap.ground import GroundRules, fuse_ground, upright, join_rings, walk
 from services.riskmap.hazard import Limits, Obstacles, hazard_layers
 from services.riskmap.obstacles import add_hits, clear_pierced
 from services.riskmap.ready_grid import grid_evidence
@@ -72,7 +72,7 @@ class TerrainModel:
         sweep, bad = read_sweep(
             points_m, transform(cloud.sensor_in_odom), self._config.resolution_m, reach_m
         )
-        kind, ground = walk(sweep, has_body(sweep, rules.step_m, rules.height_m), cells, rules)
+        kind, ground = walk(sweep, upright(sweep, rules.step_m, rules.height_m), cells, rules)
         fuse_ground(sweep, kind, ground, cells, rules)
         c = self._config
         lowest_m = max(c.knee_height_m, c.max_step_m) if c.risk_blind else c.max_step_m
@@ -115,8 +115,11 @@ class TerrainModel:
         rules: GroundRules,
     ) -> None:
         radius_m, sigma_m = self._config.start_radius_m, self._config.start_sigma_m
-        reach_m, slope = start_ground(sweep, kind, ground, radius_m, *_body_slope(base), rules)
-        suppose_start(base[0, 3], base[1, 3], reach_m, slope, sigma_m, self._window.cells, rules)
+        own = _body_slope(base)
+        x, y = float(sweep.sensor[0]), float(sweep.sensor[1])
+        feet_m = self._feet_m + own[0] * (x - float(base[0, 3])) + own[1] * (y - float(base[1, 3]))
+        reach_m, slope = start_ground(sweep, kind, ground, radius_m, *own, feet_m, rules)
+        suppose_start(x, y, feet_m, reach_m, slope, sigma_m, self._window.cells, rules)
 
     def apply_grid(self, grid: ReadyGrid, robot: Pose, only_new: bool) -> None:
         """Take over a ready grid: obstacles where it is occupied, supposed ground at the robot's feet where free."""
