@@ -20,7 +20,9 @@ _STEEP = 1.2
 _STEEP_M = 0.7
 """... over the first so many metres since what was last seen of the bearing, ..."""
 _GENTLE = 0.15
-"""... and by so much beyond them: where ground rises, rings lie close together, so a wide gap is level or falls."""
+"""... and by so much beyond them, or as steeply as it has risen so far."""
+_TREND_M = 0.15
+"""How steeply ground has risen so far is read from gaps longer than this, m."""
 _FOOT_M = 0.05
 """The lowest point of something upright is its foot on the ground when it is so near to the ground before it, m."""
 _TRUSTED_POINTS = 4.0
@@ -39,7 +41,8 @@ _STEEP_LOOK = 0.1
 class GroundRules(NamedTuple):
     """Numbers of the ground model; see the config. resolution_m, then the window's origin: global and in memory.
 
-    travelled_m: distance driven so far. feet_m: height of the ground at the robot.
+    travelled_m: distance driven so far. feet_m: height, under the sensor, of the plane that the robot stands on;
+    lean_x, lean_y: rise per metre of that plane.
     """
 
     resolution_m: float
@@ -49,6 +52,8 @@ class GroundRules(NamedTuple):
     column0: int
     travelled_m: float
     feet_m: float
+    lean_x: float
+    lean_y: float
     height_m: float
     step_m: float
     slope: float
@@ -124,6 +129,7 @@ def walk(
         angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
         dx, dy = math.cos(angle), math.sin(angle)
         last_z, last_r = rules.feet_m, 0.0
+        trend = rules.lean_x * dx + rules.lean_y * dy
         for k in range(sweep.low.shape[1]):
             z = sweep.low[b, k]
             if z == np.inf:
@@ -141,8 +147,11 @@ def walk(
             elif body[b, k]:
                 is_ground = z <= last_z + _FOOT_M + 0.1 * min(gap, 0.5)
             else:
-                is_ground = z <= last_z + rules.step_m + _STEEP * min(gap, _STEEP_M) + _GENTLE * max(gap - _STEEP_M, 0.0)  # fmt: skip  # noqa: E501
+                goes_on = max(_GENTLE, min(trend, rules.slope)) * max(gap - _STEEP_M, 0.0)
+                is_ground = z <= last_z + rules.step_m + _STEEP * min(gap, _STEEP_M) + goes_on
             if is_ground:
+                if gap > _TREND_M:
+                    trend = 0.5 * (trend + (z - last_z) / gap)
                 kind[b, k], ground[b, k] = GROUND, z
                 last_z, last_r = z, r
                 continue

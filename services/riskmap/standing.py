@@ -23,7 +23,7 @@ _UNSEEN_START_M = 1.0
 
 @njit
 def stand_here(
-    x: float, y: float, radius_m: float, slope_x: float, slope_y: float, sigma_m: float,
+    x: float, y: float, z: float, radius_m: float, sigma_m: float,
     cells: NDArray[np.float32], rules: GroundRules,
 ) -> None:  # fmt: skip
     """The robot stands on its disc of ground: supposed in its own plane, and nothing stands in its middle."""
@@ -36,12 +36,12 @@ def stand_here(
             if away > radius_m or row < 0:
                 continue
             cell = cells[row, column]
-            z = rules.feet_m + slope_x * dx + slope_y * dy
-            if cell[VARIANCE] > 0.0 and abs(cell[MEAN] - z) > rules.height_m:  # another storey
+            plane = z + rules.lean_x * dx + rules.lean_y * dy
+            if cell[VARIANCE] > 0.0 and abs(cell[MEAN] - plane) > rules.height_m:  # another storey
                 cell[VARIANCE], cell[SEEN], cell[CEILING_SEEN] = 0.0, 0.0, 0.0
             if cell[SEEN] == BELOW:
                 cell[SEEN] = 0.0
-            suppose(cell, z, sigma_m * sigma_m, rules)
+            suppose(cell, plane, sigma_m * sigma_m, rules)
             if away <= radius_m - 1.5 * res and cell[HIT_WEIGHT] > 0.0:
                 speak_against(cell, rules)
 
@@ -52,9 +52,6 @@ def start_ground(
     kind: NDArray[np.uint8],
     ground: NDArray[np.float32],
     radius_m: float,
-    slope_x: float,
-    slope_y: float,
-    feet_m: float,
     rules: GroundRules,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(BEARINGS,) each: how far ground around the start may be supposed, m, and its rise per metre.
@@ -62,13 +59,13 @@ def start_ground(
     Straight from the robot's feet to the first ground seen: up to `radius_m`, or to that ground if it is not much
     farther away, or to the first obstacle. Where the first ground does not lie about in the robot's own plane, or none
     is seen, less; there and up to obstacles the slope is that of the bearings to the left and the right, or the
-    robot's own where there are none. feet_m: the robot's plane below the sensor.
+    robot's own where there are none.
     """
-    stop, first, rise = _first_seen(sweep, kind, ground, feet_m)
+    stop, first, rise = _first_seen(sweep, kind, ground, rules)
     reach, slope = np.full(BEARINGS, min(radius_m, _UNSEEN_START_M)), np.full(BEARINGS, np.nan)
     for b in range(BEARINGS):
         angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
-        own = slope_x * math.cos(angle) + slope_y * math.sin(angle)
+        own = rules.lean_x * math.cos(angle) + rules.lean_y * math.sin(angle)
         nearest_stop, nearest = np.inf, b
         for away in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
             other = (b + away) % BEARINGS
@@ -80,13 +77,13 @@ def start_ground(
         elif first[nearest] < np.inf and abs(rise[nearest] - own) <= _LIKE_OWN_SLOPE:
             seen_m = first[nearest] if first[nearest] <= radius_m + rules.max_gap_m else 0.0
             reach[b], slope[b] = min(max(radius_m, seen_m), nearest_stop), rise[nearest]
-    _between(slope, slope_x, slope_y)
+    _between(slope, rules)
     return reach, slope
 
 
 @njit
 def _first_seen(
-    sweep: Sweep, kind: NDArray[np.uint8], ground: NDArray[np.float32], feet_m: float
+    sweep: Sweep, kind: NDArray[np.uint8], ground: NDArray[np.float32], rules: GroundRules
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Of each bearing: range of the first obstacle, of the first ground (inf: none), and its rise from the feet."""
     stop, first, rise = np.full(BEARINGS, np.inf), np.full(BEARINGS, np.inf), np.zeros(BEARINGS)
@@ -97,12 +94,12 @@ def _first_seen(
                 break
             if kind[b, k] == GROUND and first[b] == np.inf:
                 first[b] = sweep.low_distance[b, k]
-                rise[b] = (ground[b, k] - feet_m) / first[b]
+                rise[b] = (ground[b, k] - rules.feet_m) / first[b]
     return stop, first, rise
 
 
 @njit
-def _between(slope: NDArray[np.float64], slope_x: float, slope_y: float) -> None:
+def _between(slope: NDArray[np.float64], rules: GroundRules) -> None:
     """Fill what is NaN, in place: linear in the angle between the nearest bearings on both sides."""
     known = np.flatnonzero(np.isfinite(slope))
     for b in range(BEARINGS):
@@ -110,7 +107,7 @@ def _between(slope: NDArray[np.float64], slope_x: float, slope_y: float) -> None
             continue
         if known.size == 0:
             angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
-            slope[b] = slope_x * math.cos(angle) + slope_y * math.sin(angle)
+            slope[b] = rules.lean_x * math.cos(angle) + rules.lean_y * math.sin(angle)
             continue
         i = np.searchsorted(known, b)
         left, right = known[(i - 1) % known.size], known[i % known.size]
@@ -122,7 +119,6 @@ def _between(slope: NDArray[np.float64], slope_x: float, slope_y: float) -> None
 def suppose_start(
     x: float,
     y: float,
-    feet_m: float,
     reach_m: NDArray[np.float64],
     slope: NDArray[np.float64],
     sigma_m: float,
@@ -138,4 +134,4 @@ def suppose_start(
             bearing = int((math.atan2(dy, dx) / (2.0 * math.pi) + 1.0) * BEARINGS) % BEARINGS
             row, column = slot_of(rules, cells.shape[0], cells.shape[1], ix, iy)
             if away <= reach_m[bearing] - 0.5 * res and row >= 0 and cells[row, column, LOG_ODDS] <= 0.0:
-                suppose(cells[row, column], feet_m + slope[bearing] * away, sigma_m * sigma_m, rules)
+                suppose(cells[row, column], rules.feet_m + slope[bearing] * away, sigma_m * sigma_m, rules)

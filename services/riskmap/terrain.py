@@ -72,7 +72,10 @@ def terrain_metrics(
     layers = np.zeros((8, *shape), dtype=np.float32)
     disc_m = max(radius_m, 1.5 * resolution_m)
     spans = _disc_spans(disc_m / resolution_m)
-    _fit_planes(ground.height_m, ground.variance, ground.known, resolution_m, disc_m, spans, fitted, layers[:4])
+    shrink = (radius_m / disc_m) ** 2
+    _fit_planes(
+        ground.height_m, ground.variance, ground.known, resolution_m, disc_m, shrink, spans, fitted, layers[:4]
+    )
     reach = max(1, int(step_reach_m / resolution_m + 1e-6))
     _find_steps(*ground[:1], *ground[2:5], resolution_m, reach, max_slope, layers[4], layers[5])
     reach = max(2, math.ceil(drop_reach_m / resolution_m))
@@ -94,13 +97,16 @@ def _fit_planes(
     known: NDArray[np.bool_],
     resolution_m: float,
     radius_m: float,
+    shrink: float,
     spans: NDArray[np.int64],
     fitted: NDArray[np.bool_],
     out: NDArray[np.float32],
 ) -> None:
     """Weighted least squares of a plane over the disc around each known cell, by running sums along the rows.
 
-    out: (4, h, w): slope, its variance, roughness, its variance.
+    radius_m: of the disc that is fitted, larger than the robot's when cells are; shrink: by what to scale its spread
+    down again, so that a slope is as uncertain on large cells as on small ones. out: (4, h, w): slope, its variance,
+    roughness, its variance.
     """
     rows, columns = height_m.shape
     reach = spans.shape[0] // 2
@@ -170,7 +176,7 @@ def _fit_planes(
             own = sv / s / min(n, _INDEPENDENT)
             fitted[r, c] = True
             out[0, r, c] = math.atan(steepness)
-            out[1, r, c] = (own + residual / n) / least / (1.0 + steepness * steepness) ** 2
+            out[1, r, c] = (own + residual / n) / (least * shrink) / (1.0 + steepness * steepness) ** 2
             out[2, r, c] = math.sqrt(residual)
             out[3, r, c] = own
 
@@ -271,6 +277,8 @@ def _find_drops(
                         continue
                     length = resolution_m * math.sqrt(float(dr * dr + dc * dc))
                     before = _rise_per_m(height_m, known, r, c, -dr, -dc, length)
+                    if math.isnan(before):
+                        continue
                     for n in range(1, reach + 1):
                         r1, c1 = r + n * dr, c + n * dc
                         if not (0 <= r1 < rows and 0 <= c1 < columns):
@@ -278,7 +286,7 @@ def _find_drops(
                         slope, here = min(max(before, 0.0), max_slope), known[r1, c1]
                         if here:
                             after = -_rise_per_m(height_m, known, r1, c1, dr, dc, length)
-                            slope = min(slope, max(after, 0.0))
+                            slope = slope if math.isnan(after) else min(slope, max(after, 0.0))
                         elif not bounded[r1, c1]:
                             continue
                         fall = float(height_m[r, c]) - float(height_m[r1, c1]) - slope * n * length
@@ -293,11 +301,11 @@ def _find_drops(
 def _rise_per_m(
     height_m: NDArray[np.float32], known: NDArray[np.bool_], r: int, c: int, dr: int, dc: int, length: float
 ) -> float:
-    """Rise per metre from a known cell over up to three more in a direction; 0 where the next is unknown."""
+    """Rise per metre from a known cell over up to three more in a direction; NaN where the next is unknown."""
     n = 0
     while n < 3 and _known_at(known, r + (n + 1) * dr, c + (n + 1) * dc):
         n += 1
-    return (float(height_m[r + n * dr, c + n * dc]) - float(height_m[r, c])) / (n * length) if n > 0 else 0.0
+    return (float(height_m[r + n * dr, c + n * dc]) - float(height_m[r, c])) / (n * length) if n > 0 else math.nan
 
 
 @njit

@@ -34,7 +34,7 @@ from services.riskmap.obstacles import add_hits, clear_pierced
 from services.riskmap.ready_grid import grid_evidence
 from services.riskmap.ring import RingWindow
 from services.riskmap.standing import stand_here, start_ground, suppose_start
-from services.riskmap.sweep import Sweep, read_sweep
+from services.riskmap.sweep import read_sweep
 from services.riskmap.terrain import Ground, TerrainMetrics, close_holes, spread_heights, terrain_metrics
 
 _SHARED = 0.1
@@ -63,25 +63,26 @@ class TerrainModel:
 
     def integrate(self, cloud: PointCloud) -> int:
         """Add a sweep, seen from the window's centre. Returns how many of its points were not finite."""
+        c, cells = self._config, self._window.cells
         base = base_in_odom(cloud.sensor_in_odom, cloud.sensor_in_base)
         first = not self._last_xyz
         self._move_to(base)
-        rules, cells = self._rules(), self._window.cells
         points_m = without_body(cloud.points_m, transform(cloud.sensor_in_base), self._box)
-        reach_m = min(cloud.range_m, self._config.window_m * math.sqrt(0.5)) + self._config.resolution_m
-        sweep, bad = read_sweep(
-            points_m, transform(cloud.sensor_in_odom), self._config.resolution_m, reach_m
-        )
+        reach_m = min(cloud.range_m, c.window_m * math.sqrt(0.5)) + c.resolution_m
+        sweep, bad = read_sweep(points_m, transform(cloud.sensor_in_odom), c.resolution_m, reach_m)
+        rules = self._rules(base, sweep.sensor)
         kind, ground = walk(sweep, upright(sweep, rules.step_m, rules.height_m), cells, rules)
         fuse_ground(sweep, kind, ground, cells, rules)
-        c = self._config
         lowest_m = max(c.knee_height_m, c.max_step_m) if c.risk_blind else c.max_step_m
         hit_now = add_hits(sweep, ground, lowest_m, c.clamp_log_odds, cells, rules)
         clear_pierced(sweep, hit_now, cells, rules)
         join_rings(sweep, kind, ground, cells, rules)
-        self._stand(base, rules)
+        x, y = self._last_xyz[:2]
+        stand_here(x, y, self._feet_m, c.footprint_radius_m, c.stand_sigma_m, cells, rules)
         if first:
-            self._suppose_start(sweep, kind, ground, base, rules)
+            reach, slope = start_ground(sweep, kind, ground, c.start_radius_m, rules)
+            x, y = float(sweep.sensor[0]), float(sweep.sensor[1])
+            suppose_start(x, y, reach, slope, c.start_sigma_m, cells, rules)
         return bad
 
     def _move_to(self, base: NDArray[np.float64]) -> None:
@@ -91,35 +92,19 @@ class TerrainModel:
         self._last_xyz = xyz
         self._feet_m = xyz[2] - self._config.base_height_m
 
-    def _rules(self) -> GroundRules:
+    def _rules(self, base: NDArray[np.float64], sensor: NDArray[np.float64]) -> GroundRules:
         c, s = self._config, self._window.spec
         row0, column0 = self._window.origin
+        lean_x, lean_y = _body_slope(base)
+        offset_m = lean_x * (sensor[0] - base[0, 3]) + lean_y * (sensor[1] - base[1, 3])
         return GroundRules(
             resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, row0=row0, column0=column0,
-            travelled_m=self._travelled_m, feet_m=self._feet_m, height_m=c.robot_height_m, step_m=c.max_step_m,
-            slope=math.tan(c.max_slope_rad), range_sigma_m=c.range_sigma_m, angle_sigma_rad=c.angle_sigma_rad,
-            drift_per_m=c.height_drift_per_m, max_gap_m=c.max_gap_m, fill_sigma_per_m=c.fill_sigma_per_m,
-            pass_log_odds=c.pass_log_odds, hit_log_odds=c.hit_log_odds,
+            travelled_m=self._travelled_m, feet_m=self._feet_m + float(offset_m), lean_x=lean_x, lean_y=lean_y,
+            height_m=c.robot_height_m, step_m=c.max_step_m, slope=math.tan(c.max_slope_rad),
+            range_sigma_m=c.range_sigma_m, angle_sigma_rad=c.angle_sigma_rad, drift_per_m=c.height_drift_per_m,
+            max_gap_m=c.max_gap_m, fill_sigma_per_m=c.fill_sigma_per_m, pass_log_odds=c.pass_log_odds,
+            hit_log_odds=c.hit_log_odds,
         )  # fmt: skip
-
-    def _stand(self, base: NDArray[np.float64], rules: GroundRules) -> None:
-        sigma_m, radius_m = self._config.stand_sigma_m, self._config.footprint_radius_m
-        stand_here(base[0, 3], base[1, 3], radius_m, *_body_slope(base), sigma_m, self._window.cells, rules)
-
-    def _suppose_start(
-        self,
-        sweep: Sweep,
-        kind: NDArray[np.uint8],
-        ground: NDArray[np.float32],
-        base: NDArray[np.float64],
-        rules: GroundRules,
-    ) -> None:
-        radius_m, sigma_m = self._config.start_radius_m, self._config.start_sigma_m
-        own = _body_slope(base)
-        x, y = float(sweep.sensor[0]), float(sweep.sensor[1])
-        feet_m = self._feet_m + own[0] * (x - float(base[0, 3])) + own[1] * (y - float(base[1, 3]))
-        reach_m, slope = start_ground(sweep, kind, ground, radius_m, *own, feet_m, rules)
-        suppose_start(x, y, feet_m, reach_m, slope, sigma_m, self._window.cells, rules)
 
     def apply_grid(self, grid: ReadyGrid, robot: Pose, only_new: bool) -> None:
         """Take over a ready grid: obstacles where it is occupied, supposed ground at the robot's feet where free."""
