@@ -21,8 +21,12 @@ _STEEP_M = 0.7
 """... over the first so many metres since what was last seen of the bearing, ..."""
 _GENTLE = 0.15
 """... and by so much beyond them, or as steeply as it has risen so far."""
+_FAR_M = 4.0
+"""... for at most so many metres: what shows up high and far away, with nothing before it, is no ground."""
 _TREND_M = 0.15
 """How steeply ground has risen so far is read from gaps longer than this, m."""
+_ALIKE = 0.06
+"""Two stretches of a bearing slope alike when they differ by no more per metre."""
 _FOOT_M = 0.05
 """The lowest point of something upright is its foot on the ground when it is so near to the ground before it, m."""
 _TRUSTED_POINTS = 4.0
@@ -147,7 +151,7 @@ def walk(
             elif body[b, k]:
                 is_ground = z <= last_z + _FOOT_M + 0.1 * min(gap, 0.5)
             else:
-                goes_on = max(_GENTLE, min(trend, rules.slope)) * max(gap - _STEEP_M, 0.0)
+                goes_on = max(_GENTLE, min(trend, rules.slope)) * min(max(gap - _STEEP_M, 0.0), _FAR_M)
                 is_ground = z <= last_z + rules.step_m + _STEEP * min(gap, _STEEP_M) + goes_on
             if is_ground:
                 if gap > _TREND_M:
@@ -267,21 +271,26 @@ def join_rings(
     for b in range(BEARINGS):
         if sweep.start[b] == sweep.start[b + 1]:
             continue
+        angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
+        dx, dy = math.cos(angle), math.sin(angle)
         distance[0], height[0], clear[0] = 0.0, rules.feet_m, False
         count, obstructed = 1, False
         for k in range(bins):
+            if kind[b, k] != GROUND and kind[b, k] != ABOVE:
+                continue
+            r = sweep.low_distance[b, k]
             if kind[b, k] == GROUND:
-                distance[count], height[count] = sweep.low_distance[b, k], ground[b, k]
-                clear[count] = not obstructed
+                distance[count], height[count], clear[count] = r, ground[b, k], not obstructed
                 count += 1
-                obstructed = False
-            elif kind[b, k] == ABOVE:
-                obstructed = True
-        angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
-        dx, dy = math.cos(angle), math.sin(angle)
+            elif not obstructed:  # the lowest ray to something upright passes over ground, too
+                near, near_z = distance[count - 1], height[count - 1]
+                _along_gap(sweep, dx, dy, near, near_z, r, sweep.low[b, k], False, cells, rules)
+            obstructed = kind[b, k] == ABOVE
         for j in range(1, count):
             fill = j > 1 and clear[j] and _joinable(distance, height, clear, count, j, rules)
-            _along_gap(sweep, dx, dy, distance[j - 1], height[j - 1], distance[j], height[j], fill, cells, rules)
+            _along_gap(
+                sweep, dx, dy, distance[j - 1], height[j - 1], distance[j], height[j], fill, cells, rules
+            )
 
 
 @njit
@@ -302,7 +311,7 @@ def _joinable(
     for k in (j - 1, j + 1):
         if 1 < k < count and clear[k]:
             other = (height[k] - height[k - 1]) / max(distance[k] - distance[k - 1], 0.05)
-            if abs(other - rise / gap) <= _GENTLE:
+            if abs(other - rise / gap) <= _ALIKE:
                 return True
     return False
 

@@ -72,7 +72,9 @@ def hazard_layers(
     factor = cvar_factor(alpha) if alpha > 0.0 else 0.0
     cvar = np.minimum(mean + np.float32(factor) * np.sqrt(variance), np.float32(limits.full_hazard_per_m))
     clearance = np.full(shape, max_clearance_m, dtype=np.float32)
-    stamp_clearance(state == LETHAL, obstacles.hit_x, obstacles.hit_y, resolution_m, max_clearance_m, clearance)
+    stamp_clearance(
+        state == LETHAL, obstacles.hit_x, obstacles.hit_y, resolution_m, max_clearance_m, clearance
+    )
     return RiskLayers(state, mean, variance, cvar, clearance)
 
 
@@ -150,9 +152,7 @@ def _combine(
 
 
 @njit
-def _metric(
-    metrics: TerrainMetrics, k: int, r: int, c: int, limits: Limits
-) -> tuple[float, float, float]:
+def _metric(metrics: TerrainMetrics, k: int, r: int, c: int, limits: Limits) -> tuple[float, float, float]:
     """(value, variance, limit) of the k-th source of hazard in a cell."""
     if k == 0:
         return metrics.slope_rad[r, c], metrics.slope_variance[r, c], limits.slope_rad

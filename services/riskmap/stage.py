@@ -95,7 +95,9 @@ class RiskMapStage:
             self._pose = odometry.message.pose
         self._drop_old_grid(now)
         for received in inputs.new(CLOUD):
-            if received.age_ns <= self._config.cloud_timeout_s * SECOND_NS and self._timely(now, received.message):
+            if received.age_ns <= self._config.cloud_timeout_s * SECOND_NS and self._timely(
+                now, received.message
+            ):
                 self._news |= self._integrate(received.message)
         for grid in inputs.new(READY_GRID):
             if self._timely(now, grid.message):

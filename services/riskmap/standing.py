@@ -70,7 +70,9 @@ def start_ground(
         for away in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
             other = (b + away) % BEARINGS
             nearest_stop = min(nearest_stop, stop[other])
-            if first[other] < np.inf and (first[nearest] == np.inf or abs(rise[other] - own) < abs(rise[nearest] - own)):
+            if first[other] < np.inf and (
+                first[nearest] == np.inf or abs(rise[other] - own) < abs(rise[nearest] - own)
+            ):
                 nearest = other
         if nearest_stop < min(first[nearest], radius_m):
             reach[b] = nearest_stop

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from planning.kernels import njit
 
-BEARINGS = 1800
-"""Bearing bins of a sweep, twice as many as common sensors have azimuths."""
+BEARINGS = 1801
+"""Bearing bins of a sweep: about twice as many as common sensors have azimuths, and prime, so that these do not all lie
+on the borders of bins, where rounding would scatter the rings of one azimuth."""
 
 
 class Sweep(NamedTuple):

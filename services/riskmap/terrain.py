@@ -74,7 +74,15 @@ def terrain_metrics(
     spans = _disc_spans(disc_m / resolution_m)
     shrink = (radius_m / disc_m) ** 2
     _fit_planes(
-        ground.height_m, ground.variance, ground.known, resolution_m, disc_m, shrink, spans, fitted, layers[:4]
+        ground.height_m,
+        ground.variance,
+        ground.known,
+        resolution_m,
+        disc_m,
+        shrink,
+        spans,
+        fitted,
+        layers[:4],
     )
     reach = max(1, int(step_reach_m / resolution_m + 1e-6))
     _find_steps(*ground[:1], *ground[2:5], resolution_m, reach, max_slope, layers[4], layers[5])
@@ -292,7 +300,9 @@ def _find_drops(
                         fall = float(height_m[r, c]) - float(height_m[r1, c1]) - slope * n * length
                         if fall > drop[r, c]:
                             drop[r, c] = fall
-                            drop_variance[r, c] = single[r, c] + single[r1, c1] + (drift_m[r, c] - drift_m[r1, c1]) ** 2
+                            drop_variance[r, c] = (
+                                single[r, c] + single[r1, c1] + (drift_m[r, c] - drift_m[r1, c1]) ** 2
+                            )
                         if here:
                             break
 
@@ -305,7 +315,11 @@ def _rise_per_m(
     n = 0
     while n < 3 and _known_at(known, r + (n + 1) * dr, c + (n + 1) * dc):
         n += 1
-    return (float(height_m[r + n * dr, c + n * dc]) - float(height_m[r, c])) / (n * length) if n > 0 else math.nan
+    return (
+        (float(height_m[r + n * dr, c + n * dc]) - float(height_m[r, c])) / (n * length)
+        if n > 0
+        else math.nan
+    )
 
 
 @njit
@@ -352,7 +366,12 @@ def spread_heights(height_m: NDArray[np.float32], known: NDArray[np.bool_], othe
             back = -1 if turn == 0 else 1
             for j in range(columns):
                 c = j if turn == 0 else columns - 1 - j
-                for dr, dc, cost in ((0, back, 1.0), (back, 0, 1.0), (back, back, 1.414), (back, -back, 1.414)):
+                for dr, dc, cost in (
+                    (0, back, 1.0),
+                    (back, 0, 1.0),
+                    (back, back, 1.414),
+                    (back, -back, 1.414),
+                ):
                     rn, cn = r + dr, c + dc
                     if 0 <= rn < rows and 0 <= cn < columns and away[rn, cn] + cost < away[r, c]:
                         away[r, c] = away[rn, cn] + cost

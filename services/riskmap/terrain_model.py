@@ -140,9 +140,7 @@ class TerrainModel:
         spread_heights(height_m, cells[VARIANCE] > 0.0, robot.z_m - c.base_height_m)
         return layers, height_m
 
-    def metrics(
-        self, cells: NDArray[np.float32]
-    ) -> tuple[Obstacles, NDArray[np.float32], TerrainMetrics]:
+    def metrics(self, cells: NDArray[np.float32]) -> tuple[Obstacles, NDArray[np.float32], TerrainMetrics]:
         """What stands in each cell, the ground's height, and its metrics, from the window's layers (CHANNELS, h, w)."""
         c, res = self._config, self._window.spec.resolution_m
         height_m = cells[MEAN].copy()

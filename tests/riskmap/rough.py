@@ -51,7 +51,7 @@ def stand_on(heights: Heights, x_m: float, y_m: float, yaw_rad: float = 0.0) -> 
 def scan(
     heights: Heights,
     base: Pose,
-    bearings: int = 900,
+    bearings: int = 600,
     rings_deg: Sequence[float] = RINGS_DEG,
     noise_m: float = 0.0,
     rng: np.random.Generator | None = None,
@@ -61,7 +61,9 @@ def scan(
     pose = sensor_pose(base)
     matrix = transform(pose)
     azimuth, elevation = np.meshgrid(
-        2.0 * math.pi * (np.arange(bearings) + 0.5) / bearings, np.radians(np.asarray(rings_deg)), indexing="ij"
+        2.0 * math.pi * (np.arange(bearings) + 0.5) / bearings,
+        np.radians(np.asarray(rings_deg)),
+        indexing="ij",
     )
     rays = np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=-1
@@ -73,7 +75,7 @@ def scan(
         p = matrix[:3, 3] + turned[index] * s[:, None]
         return np.minimum(p[:, 2] - heights(p[:, 0], p[:, 1]), ceiling_m - p[:, 2])
 
-    pace = 0.05
+    pace = 0.1
     for s in np.arange(pace, RANGE_M + pace, pace):
         below = over(alive, np.full(len(alive), s)) < 0.0
         hit = alive[below]
@@ -94,18 +96,24 @@ def scan(
 def sensor_pose(base: Pose) -> Pose:
     """The sensor's pose in odom on a robot at `base`: MOUNT, turned with the body."""
     up = transform(base)[:3, :3] @ np.array([MOUNT.x_m, MOUNT.y_m, MOUNT.z_m])
-    return base.model_copy(
-        update={"x_m": base.x_m + up[0], "y_m": base.y_m + up[1], "z_m": base.z_m + up[2]}
-    )
+    return base.model_copy(update={"x_m": base.x_m + up[0], "y_m": base.y_m + up[1], "z_m": base.z_m + up[2]})
 
 
 def cloud_at(
-    heights: Heights, base: Pose, stamp_ns: int = 1, points_m: NDArray[np.float32] | None = None, **how: object
+    heights: Heights,
+    base: Pose,
+    stamp_ns: int = 1,
+    points_m: NDArray[np.float32] | None = None,
+    **how: object,
 ) -> PointCloud:
     """One sweep as a message."""
     points = scan(heights, base, **how) if points_m is None else points_m  # type: ignore[arg-type]
     return PointCloud(
-        stamp_ns=stamp_ns, sensor_in_odom=sensor_pose(base), sensor_in_base=MOUNT, range_m=RANGE_M, points_m=points
+        stamp_ns=stamp_ns,
+        sensor_in_odom=sensor_pose(base),
+        sensor_in_base=MOUNT,
+        range_m=RANGE_M,
+        points_m=points,
     )
 
 

@@ -46,12 +46,16 @@ def layers(
     return hazard_layers(metrics, found, limits, resolution_m, alpha, 1.5)
 
 
-def metrics_of(height_m: NDArray[np.float64], resolution_m: float = 0.1, sigma_m: float = 0.01) -> TerrainMetrics:
+def metrics_of(
+    height_m: NDArray[np.float64], resolution_m: float = 0.1, sigma_m: float = 0.01
+) -> TerrainMetrics:
     return terrain_metrics(ground_of(height_m, sigma_m), resolution_m, RADIUS_M, math.tan(0.42), 0.25, 1.5)
 
 
 @given(value=st.floats(0.0, 0.25), deviation=st.floats(0.001, 0.06))
-def test_mean_and_variance_of_the_hazard_are_about_those_of_the_integral(value: float, deviation: float) -> None:
+def test_mean_and_variance_of_the_hazard_are_about_those_of_the_integral(
+    value: float, deviation: float
+) -> None:
     """Three points are exact for the fourth power; the kink at the limit and the tail cost a few percent of full."""
     found = propagate(value, deviation**2, 0.42, LIMITS)
     normal = stats.norm(value, deviation)

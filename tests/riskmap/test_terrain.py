@@ -75,9 +75,7 @@ def test_the_plane_is_that_of_weighted_least_squares(seed: int, share: float) ->
         assert found.fitted.all()
 
 
-@given(
-    slope=st.floats(0.0, 0.8), heading=st.floats(0.0, 6.28), resolution_m=st.sampled_from([0.1, 0.2, 0.4])
-)
+@given(slope=st.floats(0.0, 0.8), heading=st.floats(0.0, 6.28), resolution_m=st.sampled_from([0.1, 0.2, 0.4]))
 def test_a_plane_has_its_slope_and_nothing_else(slope: float, heading: float, resolution_m: float) -> None:
     x, y = centres(24, resolution_m)
     rise = math.tan(slope)
@@ -164,7 +162,10 @@ def test_roughness_is_the_deviation_from_the_plane() -> None:
 
 def test_less_certain_heights_make_a_less_certain_slope() -> None:
     flat = np.zeros((12, 12))
-    assert metrics(flat, sigma_m=0.05).slope_variance[6, 6] > 5 * metrics(flat, sigma_m=0.01).slope_variance[6, 6]
+    assert (
+        metrics(flat, sigma_m=0.05).slope_variance[6, 6]
+        > 5 * metrics(flat, sigma_m=0.01).slope_variance[6, 6]
+    )
 
 
 def test_holes_close_only_among_like_neighbours() -> None:
