@@ -11,7 +11,7 @@ VARIANCE: Final = 1
 SEEN: Final = 2
 """Points of ground that are in the mean; 0: the height is only supposed (interpolated, driven on, or at the start).
 
-BELOW, with a variance of 0: no ground is known, but rays went over the cell that bound it from above; MEAN is the bound.
+BELOW, with a variance of 0: no ground is known, but rays went over the cell; MEAN bounds it from above.
 """
 BELOW: Final = -1.0
 TRAVELLED: Final = 3

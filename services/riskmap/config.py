@@ -120,7 +120,7 @@ class Config(BaseModel):
     max_clearance_m: float = Field(1.5, gt=0.3, le=5, description="Clearance is measured up to this, m.")
     risk_blind: bool = Field(
         False,
-        description="Experiments only: no hazard from terrain, only things above the knee are obstacles, CVaR is the mean.",
+        description="Experiments only: no terrain hazard, only what is above the knee is an obstacle, no CVaR.",
     )
     knee_height_m: float = Field(
         0.4, gt=0, le=2, description="What a risk-blind robot takes for an obstacle, m."

@@ -13,7 +13,7 @@ from services.riskmap.config import Config
 
 
 def transform(pose: Pose) -> NDArray[np.float64]:
-    """The 4 x 4 matrix that takes points of the posed frame into the other one (REP-103: Rz(yaw) Ry(pitch) Rx(roll))."""
+    """The 4 x 4 matrix from the posed frame into the other one (REP-103: Rz(yaw) Ry(pitch) Rx(roll))."""
     cr, sr = math.cos(pose.roll_rad), math.sin(pose.roll_rad)
     cp, sp = math.cos(pose.pitch_rad), math.sin(pose.pitch_rad)
     cy, sy = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)

@@ -27,6 +27,8 @@ _TREND_M = 0.15
 """How steeply ground has risen so far is read from gaps longer than this, m."""
 _ALIKE = 0.06
 """Two stretches of a bearing slope alike when they differ by no more per metre."""
+_BESIDE_M = 0.2
+"""The slope before and after a gap is taken over so much or more, m."""
 _FOOT_M = 0.05
 """The lowest point of something upright is its foot on the ground when it is so near to the ground before it, m."""
 _TRUSTED_POINTS = 4.0
@@ -276,21 +278,35 @@ def join_rings(
         distance[0], height[0], clear[0] = 0.0, rules.feet_m, False
         count, obstructed = 1, False
         for k in range(bins):
-            if kind[b, k] != GROUND and kind[b, k] != ABOVE:
+            seen = _seen_from(kind, b, k)
+            if seen < 0:
                 continue
-            r = sweep.low_distance[b, k]
-            if kind[b, k] == GROUND:
-                distance[count], height[count], clear[count] = r, ground[b, k], not obstructed
+            r = float(sweep.low_distance[seen, k])
+            if kind[seen, k] == GROUND:
+                distance[count], height[count], clear[count] = r, ground[seen, k], not obstructed
                 count += 1
             elif not obstructed:  # the lowest ray to something upright passes over ground, too
                 near, near_z = distance[count - 1], height[count - 1]
-                _along_gap(sweep, dx, dy, near, near_z, r, sweep.low[b, k], False, cells, rules)
-            obstructed = kind[b, k] == ABOVE
+                _along_gap(sweep, dx, dy, near, near_z, r, sweep.low[seen, k], False, cells, rules)
+            obstructed = kind[seen, k] == ABOVE
         for j in range(1, count):
             fill = j > 1 and clear[j] and _joinable(distance, height, clear, count, j, rules)
             _along_gap(
                 sweep, dx, dy, distance[j - 1], height[j - 1], distance[j], height[j], fill, cells, rules
             )
+
+
+@njit
+def _seen_from(kind: NDArray[np.uint8], b: int, k: int) -> int:
+    """Which of a bearing and its two neighbours has something at or below the robot's height in a bin; -1: none.
+
+    On a robot that leans, the rings of one azimuth spread over neighbouring bearings. The bearing itself comes first.
+    """
+    for step in (0, -1, 1):
+        other = (b + step) % BEARINGS
+        if kind[other, k] == GROUND or kind[other, k] == ABOVE:
+            return other
+    return -1
 
 
 @njit
@@ -308,9 +324,15 @@ def _joinable(
         return False
     if abs(rise) <= 0.5 * rules.step_m:
         return True
-    for k in (j - 1, j + 1):
-        if 1 < k < count and clear[k]:
-            other = (height[k] - height[k - 1]) / max(distance[k] - distance[k - 1], 0.05)
+    for forwards in (False, True):
+        k = j if forwards else j - 1
+        end = k
+        while 1 <= end < count and abs(distance[end] - distance[k]) < _BESIDE_M:
+            if not clear[end + 1 if forwards and end + 1 < count else end]:
+                break
+            end += 1 if forwards else -1
+        if 1 <= end < count and abs(distance[end] - distance[k]) >= _BESIDE_M:
+            other = (height[end] - height[k]) / (distance[end] - distance[k])
             if abs(other - rise / gap) <= _ALIKE:
                 return True
     return False

@@ -80,7 +80,7 @@ def hazard_layers(
 
 @njit
 def shape_of(value: float, limit: float, limits: Limits) -> float:
-    """Hazard rate of a metric, 1/m: (value / limit)^4 up to the limit, from there in a straight line to the full one."""
+    """Hazard rate of a metric, 1/m: (value / limit)^4 up to the limit, then in a straight line to the full one."""
     ratio = max(value, 0.0) / limit
     if ratio <= 1.0:
         return limits.limit_hazard_per_m * ratio**4

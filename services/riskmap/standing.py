@@ -14,7 +14,7 @@ from services.riskmap.obstacles import speak_against
 from services.riskmap.sweep import BEARINGS, Sweep
 
 _NEIGHBOURS = 5
-"""Rays of one azimuth may lie in several bins, and some are lost: a bearing is read with so many bins on either side."""
+"""Rays of one azimuth may lie in several bins, and some are lost: a bearing is read with so many bins beside it."""
 _LIKE_OWN_SLOPE = 0.2
 """The first ground seen may rise or fall, from the robot's own plane, by so much per metre."""
 _UNSEEN_START_M = 1.0

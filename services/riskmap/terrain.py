@@ -85,9 +85,22 @@ def terrain_metrics(
         layers[:4],
     )
     reach = max(1, int(step_reach_m / resolution_m + 1e-6))
-    _find_steps(*ground[:1], *ground[2:5], resolution_m, reach, max_slope, layers[4], layers[5])
+    _find_steps(
+        ground.height_m,
+        ground.single,
+        ground.drift_m,
+        ground.known,
+        resolution_m,
+        reach,
+        max_slope,
+        layers[4],
+        layers[5],
+    )
     reach = max(2, math.ceil(drop_reach_m / resolution_m))
-    _find_drops(*ground[:1], *ground[2:], resolution_m, reach, max_slope, layers[6], layers[7])
+    _find_drops(
+        ground.height_m, ground.single, ground.drift_m, ground.known, ground.bounded, resolution_m, reach, max_slope,
+        layers[6], layers[7],
+    )  # fmt: skip
     return TerrainMetrics(fitted, *layers)
 
 

@@ -28,7 +28,7 @@ from services.riskmap.cells import (
 from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
 from services.riskmap.extrinsics import base_in_odom, body_box, transform, without_body
-from services.riskmap.ground import GroundRules, fuse_ground, upright, join_rings, walk
+from services.riskmap.ground import GroundRules, fuse_ground, join_rings, upright, walk
 from services.riskmap.hazard import Limits, Obstacles, hazard_layers
 from services.riskmap.obstacles import add_hits, clear_pierced
 from services.riskmap.ready_grid import grid_evidence
@@ -38,7 +38,7 @@ from services.riskmap.sweep import read_sweep
 from services.riskmap.terrain import Ground, TerrainMetrics, close_holes, spread_heights, terrain_metrics
 
 _SHARED = 0.1
-"""Share of a supposed height's variance that it does not have in common with its neighbours: they were supposed together."""
+"""Share of a supposed height's variance that its neighbours, which were supposed together with it, do not share."""
 
 
 class TerrainModel:
@@ -118,7 +118,8 @@ class TerrainModel:
         if only_new:
             take = (cells[:, LOG_ODDS] == 0.0) & (cells[:, VARIANCE] == 0.0) & (cells[:, HIT_WEIGHT] == 0.0)
         cells[take, LOG_ODDS] = evidence[take]
-        cells[np.ix_(take, [HIT_WEIGHT, HIT_X, HIT_Y])] = 0.0
+        for hits in (HIT_WEIGHT, HIT_X, HIT_Y):
+            cells[take, hits] = 0.0
         bare = take & (evidence < 0.0) & (cells[:, VARIANCE] == 0.0)
         cells[bare, MEAN] = robot.z_m - self._config.base_height_m
         cells[bare, VARIANCE] = self._config.start_sigma_m**2
@@ -157,8 +158,8 @@ class TerrainModel:
         room = np.where(covered, cells[CEILING] - cells[MEAN], np.inf).astype(np.float32)
         room_variance = np.where(covered, variance + drift_m**2 + c.range_sigma_m**2, 0.0).astype(np.float32)
         hit = blocked & (cells[HIT_WEIGHT] > 0.0)
-        offsets = (np.where(hit, cells[k], 0.0).astype(np.float32) for k in (HIT_X, HIT_Y))
-        obstacles = Obstacles(cells[LOG_ODDS], *offsets, room, room_variance)
+        hit_x, hit_y = (np.where(hit, cells[k], 0.0).astype(np.float32) for k in (HIT_X, HIT_Y))
+        obstacles = Obstacles(cells[LOG_ODDS], hit_x, hit_y, room, room_variance)
         metrics = terrain_metrics(
             Ground(height_m, variance, single, drift_m, known, bounded & ~known), res, c.footprint_radius_m,
             math.tan(c.max_slope_rad), c.step_reach_m, c.drop_reach_m,

@@ -90,7 +90,8 @@ def scan(
     reach = slant[seen]
     if rng is not None:
         reach = reach + rng.normal(0.0, noise_m, len(reach))
-    return (rays[seen] * reach[:, None]).astype(np.float32)
+    points: NDArray[np.float32] = (rays[seen] * reach[:, None]).astype(np.float32)
+    return points
 
 
 def sensor_pose(base: Pose) -> Pose:
