@@ -102,6 +102,8 @@ class GcpStage:
         mean = np.array(_robot_xyz(odometry))
         covariance = np.asarray(odometry.covariance)[:2, :2]
         variance, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
+        # The breadcrumbs around drift along with the robot: its place among them is better known than that in `map`.
+        variance = np.minimum(variance, self.config.max_pose_spread_m**2)
         spread = rng.standard_normal((self.config.particles, 2)) * np.sqrt(np.maximum(variance, 0.0))
         xyz = np.tile(mean, (self.config.particles, 1))
         xyz[:, :2] += spread @ axes.T

@@ -27,6 +27,10 @@ from services.reconciler.config import Config
 from services.reconciler.path import Ground, headings
 
 
+_MOST_SPREAD = 0.05
+"""Of a pose in `odom`, m and rad."""
+
+
 @dataclass(frozen=True, slots=True)
 class Committed:
     """The policy that is being driven: a line in odom, and the lattice nodes on it.
@@ -152,7 +156,9 @@ def junction_particles(
     Returns (nodes, headings, weights), one entry a distinct state, the junction itself always among them.
     """
     rng = stream(seed, "reconciler", "junction", episode)
-    spread = np.sqrt(np.maximum(np.diag(odometry.covariance), 0.0)) + np.array([0.05, 0.05, 0.05])
+    # The junction lies in `odom`, where nothing drifts within a horizon; the covariance is that of the place in `map`.
+    deviation = np.sqrt(np.maximum(np.diag(odometry.covariance), 0.0))
+    spread = np.minimum(deviation, _MOST_SPREAD) + np.array([0.05, 0.05, 0.05])
     offset = rng.normal(size=(count, 3)) * spread
     x = irm.anchor_m[node, 0] + offset[:, 0]
     y = irm.anchor_m[node, 1] + offset[:, 1]

@@ -135,7 +135,9 @@ def test_an_opening_that_was_seen_only_once_was_noise() -> None:
         scene = Scene(covered_to_m=-99.0, opening_rounds=3)
         scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
         looked = np.ones(scene.flat.spec.shape, np.bool_)
-        looked[scene.flat.spec.cell_of(3.7, 2.5)] = False  # a sliver: else it would be plain that nothing is left
+        looked[scene.flat.spec.cell_of(3.7, 2.5)] = (
+            False  # a sliver: else it would be plain that nothing is left
+        )
         scene.belief.cover(scene.flat.spec, looked)
         for _ in range(rounds + 1):
             scene.round()
