@@ -37,6 +37,8 @@ from services.sim.follower import Command, Follower, TimedPath
 from services.sim.follower import FollowerState as FollowerMemory
 from services.sim.lidar import Lidar
 from services.sim.robot import Robot, RobotState
+from services.sim.scene import Scene
+from services.sim.terrain import rotation
 from services.sim.world import World, with_start
 from services.sim.worlds import build_world
 
@@ -74,9 +76,13 @@ class SimStage:
 
     def __init__(self, config: Config, world: World, seed: int) -> None:
         self._config, self._world, self._seed = config, world, seed
-        self._robot = Robot(world, config, stream(seed, "sim", "slip"))
-        self._lidar = Lidar(world, config.lidar)
-        self._judge = Judge(world, config.robot.footprint_radius_m, config.coverage_sensor)
+        self._scene = Scene(world)
+        self._robot = Robot(world, config, stream(seed, "sim", "slip"), self._scene)
+        self._lidar = Lidar(world, config.lidar, self._scene)
+        robot = config.robot
+        self._judge = Judge(
+            world, robot.footprint_radius_m, config.coverage_sensor, robot, config.lidar.height_m
+        )
         self._follower = Follower(config.robot)
         self._command = _STANDING
         self._plan = (0, 0, False)
@@ -94,6 +100,7 @@ class SimStage:
         """Drive until now, then read the newest plan, and publish what is due."""
         noise = stream(self._seed, "sim", "slam", self._tick)
         self._robot.rng = stream(self._seed, "sim", "slip", self._tick)
+        self._move_scene(now / SECOND_NS)
         self._drive(now, noise)
         self._read_plan(now, inputs)
         self._estimate = self._noisy_pose(noise)
@@ -130,6 +137,13 @@ class SimStage:
             after = self._robot.step(self._command.speed_mps, self._command.turn_rate_radps, duration_s)
             self._distance_m += math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
             self._blocked |= after.blocked
+
+    def _move_scene(self, now_s: float) -> None:
+        """People walk and doors close."""
+        state, radius_m = self._robot.state, self._config.robot.footprint_radius_m
+        at = (state.x_m, state.y_m)
+        if self._scene.advance(now_s, at, radius_m):
+            self._judge.close(self._scene.occupied, at)
 
     def _follow(self, now_s: float) -> Command:
         return self._follower.step(*self._estimate, now_s, self._blocked)
@@ -181,9 +195,18 @@ class SimStage:
         self._slots[what] = slot
         return True
 
-    def _pose(self, z_m: float = 0.0) -> Pose:
-        """The estimated pose at a height."""
-        return Pose(x_m=self._estimate.x_m, y_m=self._estimate.y_m, z_m=z_m, yaw_rad=self._estimate.yaw_rad)
+    def _pose(self, above_m: float = 0.0) -> Pose:
+        """The estimated pose, so far along the body's up axis; height and attitude are the true ones."""
+        state, at = self._robot.state, self._estimate
+        up = rotation(state.roll_rad, state.pitch_rad, at.yaw_rad)[:, 2] * above_m
+        return Pose(
+            x_m=at.x_m + float(up[0]),
+            y_m=at.y_m + float(up[1]),
+            z_m=state.z_m + float(up[2]),
+            yaw_rad=at.yaw_rad,
+            roll_rad=state.roll_rad,
+            pitch_rad=state.pitch_rad,
+        )
 
     def _variances(self) -> NDArray[np.float64]:
         """Of x, y and yaw, shape (3,)."""
@@ -214,10 +237,15 @@ class SimStage:
         )
 
     def _cloud(self, now: Stamp) -> PointCloud:
-        points_m = self._lidar.scan(*self._robot.state[:3], stream(self._seed, "sim", "lidar", self._tick))
-        lidar = self._config.lidar
+        state, lidar = self._robot.state, self._config.lidar
+        noise = stream(self._seed, "sim", "lidar", self._tick)
+        points_m = self._lidar.scan(*state[:3], noise, state.z_m, state.roll_rad, state.pitch_rad)
         return PointCloud(
-            stamp_ns=now, sensor_in_odom=self._pose(lidar.height_m), range_m=lidar.range_m, points_m=points_m
+            stamp_ns=now,
+            sensor_in_odom=self._pose(lidar.height_m),
+            ground_z_m=state.z_m,
+            range_m=lidar.range_m,
+            points_m=points_m,
         )
 
     def _coverage_scan(self, now: Stamp) -> CoverageScan:
@@ -275,18 +303,24 @@ class SimStage:
 
     def _report(self, now: Stamp) -> JudgeReport:
         state, judge = self._robot.state, self._judge
-        faster_mps = self._config.contact_lost_speed_mps
         return JudgeReport(
             stamp_ns=now,
             world=self._world.name,
-            true_pose=Pose(x_m=state.x_m, y_m=state.y_m, yaw_rad=state.yaw_rad),
+            true_pose=Pose(
+                x_m=state.x_m,
+                y_m=state.y_m,
+                z_m=state.z_m,
+                yaw_rad=state.yaw_rad,
+                roll_rad=state.roll_rad,
+                pitch_rad=state.pitch_rad,
+            ),
             coverage=judge.coverage_fraction,
             covered_area_m2=judge.covered_area_m2,
             reachable_area_m2=judge.reachable_area_m2,
             distance_m=self._distance_m,
             contacts=state.contacts,
             lost=state.lost,
-            lost_reason=f"ran into a wall at more than {faster_mps:g} m/s" if state.lost else "",
+            lost_reason=self._robot.lost_reason,
         )
 
     # --- snapshots --------------------------------------------------------------------------------------------
@@ -303,6 +337,8 @@ class SimStage:
                 "plan": list(self._plan),
                 "estimate": list(self._estimate),
                 "covered": np.packbits(self._judge.covered),
+                "closed": self._scene.closed,
+                "reachable": np.packbits(self._judge.reachable) if any(self._scene.closed) else None,
                 "keyframes": self._keyframes,
                 "clock": [self._tick, self._last_ns],
                 "distance_m": self._distance_m,
@@ -316,8 +352,13 @@ class SimStage:
         """Go on from a snapshot of a stage with the same configuration and seed."""
         state = unpack_snapshot(snapshot)
         cells = self._judge.spec.width * self._judge.spec.height
+        shape = self._judge.spec.shape
+        if state["reachable"] is not None:
+            self._scene.set_closed(state["closed"])
+            reachable = np.unpackbits(state["reachable"], count=cells).astype(np.bool_).reshape(shape)
+            self._judge.take_over(self._scene.occupied, reachable)
         covered = np.unpackbits(state["covered"], count=cells).astype(np.bool_)
-        self._judge.set_covered(covered.reshape(self._judge.spec.shape))
+        self._judge.set_covered(covered.reshape(shape))
         self._robot.state = RobotState(*state["robot"])
         self._follower.set_path(TimedPath(**state["path"]) if state["path"] is not None else None)
         memory = state["follower"]

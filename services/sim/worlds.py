@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from services.sim.cave import cave
 from services.sim.config import SimConfig
+from services.sim.lava_tube import lava_tube
 from services.sim.map_server import load_map_server
 from services.sim.maze import maze
 from services.sim.subway import subway
@@ -27,6 +29,8 @@ __all__ = [
     "World",
     "WorldError",
     "build_world",
+    "cave",
+    "lava_tube",
     "load_map_server",
     "make_world",
     "maze",
@@ -39,6 +43,8 @@ _MAKERS: dict[str, Callable[[int], World]] = {
     "subway_2x": lambda seed: subway(seed, 2),
     "subway_3x": lambda seed: subway(seed, 3),
     "maze": maze,
+    "cave": cave,
+    "lava_tube": lava_tube,
 }
 WORLD_NAMES: tuple[str, ...] = tuple(_MAKERS)
 
