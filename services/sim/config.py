@@ -113,6 +113,15 @@ class SlamConfig(_Model):
     """A keyframe is added at this distance from the last one."""
 
 
+class ElevationConfig(_Model):
+    """How a height image is read; None: as its YAML file or its own tags say."""
+
+    resolution_m: float | None = Field(default=None, gt=0.0, le=50.0)
+    """Metres a pixel."""
+    height_scale_m: float | None = Field(default=None, gt=0.0, le=1000.0)
+    """Metres a unit of the pixels."""
+
+
 class Start(_Model):
     """Where the robot starts, in the frame of the world (map)."""
 
@@ -126,9 +135,16 @@ class SimConfig(_Model):
     """Everything the simulator needs; with the code and the mission's seed it fixes every byte of a run."""
 
     world: str = "subway_1x"
-    """Name of a built-in world (see `worlds.WORLD_NAMES`); not used when `map_file` is given."""
+    """Name of a built-in world (see `worlds.WORLD_NAMES`); not used when a file is given."""
     map_file: str | None = None
     """Path of a ROS map_server YAML file."""
+    mesh_file: str | None = None
+    """Path of a triangle mesh (OBJ, STL, PLY, DAE) in metres, z up."""
+    dem_file: str | None = None
+    """Path of a height image (npy, GeoTIFF, 16-bit PNG)."""
+    elevation: ElevationConfig = ElevationConfig()
+    raster_resolution_m: float = Field(default=0.2, ge=0.05, le=0.5)
+    """Cells of the raster that a mesh or a height image becomes."""
     seed: int = Field(default=0, ge=0, lt=2**63)
     """Of the built-in world; noise comes from the seed of the mission."""
     start: Start | None = None
@@ -145,3 +161,10 @@ class SimConfig(_Model):
     """On a slope of tangent t the robot makes 1 - fraction t of the way uphill, and drifts fraction t of it down."""
     contact_lost_speed_mps: Positive = 0.5
     """Contact at more than this speed into a wall breaks the robot: it is lost."""
+
+    @model_validator(mode="after")
+    def _one_file(self) -> Self:
+        given = [n for n in ("map_file", "mesh_file", "dem_file") if getattr(self, n) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} exclude each other")
+        return self

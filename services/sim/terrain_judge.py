@@ -1,8 +1,8 @@
 """The judge on uneven ground: where the robot can stand at acceptable risk, and what it sees over bumps.
 
 A robot can stand on a cell when, over its disc there, the least-squares plane is no steeper than its slope limit,
-no two heights within `STEP_M` of each other differ by more than its step limit, no ground stands higher over the
-plane than its belly, and neither wall nor low ceiling is touched.
+no two heights within `STEP_M` of each other differ by more than its step limit (beyond what the slope on both sides
+explains), no ground stands higher over the plane than its belly, and neither wall nor low ceiling is touched.
 """
 
 from __future__ import annotations
@@ -29,9 +29,8 @@ def acceptable_ground(spec: GridSpec, solid: BoolGrid, floor_m: Heights, robot: 
     cell = spec.resolution_m
     free = configuration_space(solid, robot.footprint_radius_m / cell)
     offsets = _offsets(robot.footprint_radius_m / cell)
-    tops = _offsets(STEP_M / cell)
-    highest = ndimage.maximum_filter(floor_m, footprint=tops, mode="nearest")
-    step = ndimage.maximum_filter(highest - floor_m, footprint=offsets, mode="nearest")
+    step = steps(floor_m, cell, max(1, math.floor(STEP_M / cell + 1e-6)), math.tan(robot.max_slope_rad))
+    step = ndimage.maximum_filter(step, footprint=offsets, mode="nearest")
     limits = np.array([math.tan(robot.max_slope_rad), robot.belly_m])
     rows, columns = np.nonzero(offsets)
     reach = offsets.shape[0] // 2
@@ -45,6 +44,50 @@ def _offsets(radius_cells: float) -> BoolGrid:
     reach = half_widths.size // 2
     columns = np.abs(np.arange(-reach, reach + 1))
     return np.asarray(columns[None, :] <= half_widths[:, None])
+
+
+@njit
+def steps(floor_m: Heights, cell_m: float, reach: int, max_slope: float) -> Heights:
+    """Greatest height difference between each cell and those up to `reach` cells from it in the eight directions.
+
+    Less what slope explains: the rise just before or just after the two cells, whichever is less, up to `max_slope`.
+    """
+    rows, columns = floor_m.shape
+    found = np.zeros((rows, columns), dtype=np.float32)
+    for row in range(rows):
+        for column in range(columns):
+            for k in range(4):
+                dr, dc = (0, 1, 1, 1)[k], (1, 0, 1, -1)[k]
+                length = math.sqrt(2.0) if k > 1 else 1.0
+                for n in range(1, reach + 1):
+                    r1, c1 = row + n * dr, column + n * dc
+                    if n * length > reach + 1e-6 or r1 >= rows or c1 < 0 or c1 >= columns:
+                        break
+                    rise = floor_m[r1, c1] - floor_m[row, column]
+                    if abs(rise) <= found[row, column] and abs(rise) <= found[r1, c1]:
+                        continue
+                    slope = _rise_beside(
+                        floor_m, row, column, n * dr, n * dc, rise, max_slope * n * length * cell_m
+                    )
+                    found[row, column] = max(found[row, column], abs(rise - slope))
+                    found[r1, c1] = max(found[r1, c1], abs(rise - slope))
+    return found
+
+
+@njit
+def _rise_beside(
+    floor_m: Heights, row: int, column: int, dr: int, dc: int, rise: float, most: float
+) -> float:
+    """What slope explains of the rise from a cell to the one (dr, dc) further: of its sign, at most `most`."""
+    rows, columns = floor_m.shape
+    sign = 1.0 if rise > 0.0 else -1.0
+    r0, c0, r1, c1 = row - dr, column - dc, row + dr, column + dc
+    r2, c2 = r1 + dr, c1 + dc
+    if r0 < 0 or r2 >= rows or min(c0, c2) < 0 or max(c0, c2) >= columns:
+        return 0.0
+    before = sign * (floor_m[row, column] - floor_m[r0, c0])
+    after = sign * (floor_m[r2, c2] - floor_m[r1, c1])
+    return sign * max(0.0, min(before, after, sign * rise, most))
 
 
 @njit
