@@ -58,7 +58,7 @@ class RobotState(NamedTuple):
     lost: bool
     """Broken, and will not move again."""
     z_m: float = 0.0
-    """Height of the ground under it: of the middle of its support plane."""
+    """Mean height of the ground under its feet."""
     roll_rad: float = 0.0
     pitch_rad: float = 0.0
     """Of the support plane; the nose up is negative (REP-103)."""
@@ -95,7 +95,7 @@ class Robot:
         slip_distance, slip_turn = rng.standard_normal(2).tolist()
         state = RobotState(x_m, y_m, yaw_rad, 0.0, 0.0, slip_distance, slip_turn, False, False, 0, False)
         if world.has_terrain:
-            height_m, forward, left = support_plane(
+            _, forward, left, height_m = support_plane(
                 self._floor_m, world.spec.resolution_m, *world.to_cells(x_m, y_m), yaw_rad, self._body
             )
             roll_rad, pitch_rad = attitude(forward, left)
@@ -225,25 +225,42 @@ def _over_terrain(
     yaw = state[_YAW] + 0.5 * turn
     dx_m = forward_m * math.cos(yaw) - side_m * math.sin(yaw)
     dy_m = forward_m * math.sin(yaw) + side_m * math.cos(yaw)
-    way = math.hypot(dx_m, dy_m)
-    straight = 0.0
-    if way > 1e-12:
-        straight = ledge_ahead(
-            floor_m, cell, before[0] + dx_m / cell, before[1] + dy_m / cell, dx_m / way, dy_m / way, body
-        )
+    straight = _ledge_after(floor_m, state, dx_m, dy_m, 0.0, parameters, body)
     if straight > 0.0:
         _contact(state, straight, HIT_LEDGE, parameters)
     else:
+        touched = state[_TOUCHING]
         _translate(occupied, movers, state, dx_m, dy_m, parameters)
+        if touched > 0.0 and _ledge_after(floor_m, state, dx_m, dy_m, RELEASE_M, parameters, body) > 0.0:
+            state[_TOUCHING] = 1.0  # not yet off the ledge: further blocks are the same contact
     state[_YAW] += turn
     after = (state[_X] / cell - ix0, state[_Y] / cell - iy0, state[_YAW])
-    height, forward, leftward = support_plane(floor_m, cell, after[0], after[1], after[2], body)
-    state[_Z] = height
+    _, forward, leftward, state[_Z] = support_plane(floor_m, cell, after[0], after[1], after[2], body)
     state[_ROLL], state[_PITCH] = attitude(forward, leftward)
     found = verdict(floor_m, cell, before, after, body)
     if found != NOT_LOST and state[_LOST] == 0.0:
         state[_LOST], state[_LOST_BY] = 1.0, found
         state[_SPEED] = state[_TURN] = 0.0
+
+
+@njit
+def _ledge_after(
+    floor_m: Heights,
+    state: NDArray[np.float64],
+    dx_m: float,
+    dy_m: float,
+    further_m: float,
+    parameters: NDArray[np.float64],
+    body: NDArray[np.float64],
+) -> float:
+    """`ledge_ahead` of a motion by (dx, dy), `further_m` beyond it."""
+    way = math.hypot(dx_m, dy_m)
+    if way < 1e-12:
+        return 0.0
+    cell, more = parameters[0], 1.0 + further_m / way
+    x = (state[_X] + more * dx_m) / cell - parameters[1]
+    y = (state[_Y] + more * dy_m) / cell - parameters[2]
+    return ledge_ahead(floor_m, cell, x, y, dx_m / way, dy_m / way, body)
 
 
 @njit

@@ -1,6 +1,7 @@
 """The ground and the ceiling as surfaces: heights at cell centres, bilinear between them.
 
 Positions are in cells as in `geometry`: x / resolution - ix0. Beyond the outermost centres the surface goes on level.
+Between four centres of which one has no ceiling there is none.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.kernels import njit
-from services.sim.terrain import BoolGrid, Heights, Terrain
+from services.sim.terrain import OPEN_M, BoolGrid, Heights, Terrain
 
 _WALL = 1e30
 """Height of the floor that stands for a wall among the bounds."""
@@ -19,20 +19,22 @@ def patch_bounds(occupied: BoolGrid, floor_m: Heights, ceiling_m: Heights) -> ND
     """Highest floor and lowest ceiling of every patch between four cell centres, float32[rows+1, columns+1, 2].
 
     Patch (r, c) lies between the centres of the cells r - 1, r and c - 1, c, so that the patches reach half a cell
-    beyond the outermost centres on every side. Where one of its cells is solid or outside, the floor is `_WALL`.
+    beyond the outermost centres on every side. Where one of its cells is solid or outside, the floor is `_WALL`; a
+    patch with an open corner is open.
     """
     rows, columns = occupied.shape
     bounds = np.empty((rows + 1, columns + 1, 2), dtype=np.float32)
     for row in range(rows + 1):
         for column in range(columns + 1):
-            high, low = -_WALL, _WALL
+            high, low, is_open = -_WALL, _WALL, False
             for k in range(4):
                 r, c = row - 1 + (k >> 1), column - 1 + (k & 1)
                 if r < 0 or c < 0 or r >= rows or c >= columns or occupied[r, c]:
                     high = _WALL
                 else:
                     high, low = max(high, floor_m[r, c]), min(low, ceiling_m[r, c])
-            bounds[row, column, 0], bounds[row, column, 1] = high, low
+                    is_open = is_open or ceiling_m[r, c] >= OPEN_M
+            bounds[row, column, 0], bounds[row, column, 1] = high, _WALL if is_open else low
     return bounds
 
 
@@ -169,6 +171,8 @@ def _meet(
     c0, c1 = min(max(column - 1, 0), columns - 1), min(max(column, 0), columns - 1)
     h00, h01 = float(heights_m[r0, c0]), float(heights_m[r0, c1])
     h10, h11 = float(heights_m[r1, c0]), float(heights_m[r1, c1])
+    if side < 0.0 and max(h00, h01, h10, h11) >= OPEN_M:
+        return math.inf
     along_u, along_v, twist = h01 - h00, h10 - h00, h00 - h01 - h10 + h11
     p, q = u + du * at - column, v + dv * at - row
     gap = side * (z + dz * at - (h00 + along_u * p + along_v * q + twist * p * q))
