@@ -126,23 +126,29 @@ def lowest(levels: Levels, spec: GridSpec) -> NDArray[np.int64]:
 
 def level_world(name: str, spec: GridSpec, levels: Levels, chosen: NDArray[np.int64]) -> World:
     """The world of one level a cell (-1: solid), without a start yet."""
+    if levels.floor_m.size == 0:
+        nothing = np.zeros(spec.shape, np.float32)
+        return World(name, spec, np.ones(spec.shape, np.bool_), (0.0, 0.0, 0.0), nothing, nothing)
     safe = np.maximum(chosen, 0)
-    free = (chosen >= 0) & ~levels.walled[safe] if levels.floor_m.size else np.zeros(spec.shape, np.bool_)
-    floor_m, ceiling_m = levels.floor_m[safe], levels.ceiling_m[safe]
-    free, floor_m, ceiling_m = _close_seams(free, floor_m, ceiling_m)
+    walled = (chosen >= 0) & levels.walled[safe]
+    free = (chosen >= 0) & ~walled
+    free, floor_m, ceiling_m = _close_seams(free, walled, levels.floor_m[safe], levels.ceiling_m[safe])
     floor_m, ceiling_m = np.where(free, floor_m, 0.0), np.where(free, ceiling_m, 0.0)
     return World(name, spec, ~free, (0.0, 0.0, 0.0), floor_m.astype(np.float32), ceiling_m.astype(np.float32))
 
 
 def _close_seams(
-    free: NDArray[np.bool_], floor_m: NDArray[np.float32], ceiling_m: NDArray[np.float32]
+    free: NDArray[np.bool_],
+    walled: NDArray[np.bool_],
+    floor_m: NDArray[np.float32],
+    ceiling_m: NDArray[np.float32],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float32], NDArray[np.float32]]:
-    """Fill slits of one cell between floors of like height: tiles of a mesh do not always meet."""
+    """Fill slits of one cell without a face between floors of like height: tiles of a mesh do not always meet."""
     free, floor_m, ceiling_m = free.copy(), floor_m.copy(), ceiling_m.copy()
     for axis in (0, 1):
         before, after = np.roll(free, 1, axis), np.roll(free, -1, axis)
         low, high = np.roll(floor_m, 1, axis), np.roll(floor_m, -1, axis)
-        seam = ~free & before & after & (np.abs(high - low) < 0.3)
+        seam = ~free & ~walled & before & after & (np.abs(high - low) < 0.3)
         floor_m[seam] = 0.5 * (low + high)[seam]
         ceiling_m[seam] = np.minimum(np.roll(ceiling_m, 1, axis), np.roll(ceiling_m, -1, axis))[seam]
         free |= seam

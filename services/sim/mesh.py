@@ -1,4 +1,7 @@
-"""Worlds from triangle meshes (OBJ, STL, PLY, DAE) in metres with z up, rasterised once to floor and ceiling."""
+"""Worlds from triangle meshes (OBJ, STL, PLY, DAE), rasterised once to floor and ceiling.
+
+Metres, but for the unit that a DAE file states; z is up, whatever a file states (exporters write y for z freely).
+"""
 
 from __future__ import annotations
 
@@ -94,13 +97,23 @@ def _unpack(arrays: Arrays) -> tuple[GridSpec, Levels]:
     return spec, Levels(**{name: arrays[name] for name in Levels._fields})  # type: ignore[arg-type]
 
 
+def _unit_m(units: str | None) -> float:
+    """Metres of a unit as trimesh names it."""
+    from trimesh.units import unit_conversion
+
+    return 1.0 if units is None else float(unit_conversion(units, "meters"))
+
+
 def read_triangles(path: Path, content: bytes) -> Triangles:
     """All triangles of a mesh file with its scene's transforms, float64[n, 3, 3]. Raises MapFileError."""
     import trimesh
 
     try:
         scene = trimesh.load_scene(io.BytesIO(content), file_type=path.suffix.lower()[1:])
-        parts = [np.asarray(mesh.triangles) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)]
+        unit_m = _unit_m(scene.units) if path.suffix.lower() == ".dae" else 1.0
+        parts = [
+            unit_m * np.asarray(mesh.triangles) for mesh in scene.dump() if isinstance(mesh, trimesh.Trimesh)
+        ]
     except Exception as error:  # a parser of foreign files raises whatever it meets
         raise _bad(path, "file", f"cannot be read as a mesh ({error})", "export it again") from None
     triangles = np.concatenate(parts).astype(np.float64) if parts else np.empty((0, 3, 3))

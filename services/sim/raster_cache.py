@@ -30,7 +30,7 @@ def cached(content: bytes, recipe: str, make: Callable[[], Arrays]) -> Arrays:
     key = hashlib.sha256(recipe.encode() + b"\0" + content).hexdigest()[:32]
     path = cache_directory() / f"{key}.npz"
     unreadable = (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile)
-    with suppress(*unreadable), np.load(path, allow_pickle=False) as stored:
+    with suppress(*unreadable), path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
         return {name: stored[name] for name in stored.files}
     arrays = make()
     with suppress(OSError):

@@ -112,11 +112,11 @@ def test_a_drop_loses_it_at_any_speed(profile: str) -> None:
 
 
 def _pit(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.where(np.hypot(x - 6.0, y - 2.0) < 0.7, -1.0, 0.0)
+    return np.asarray(np.where(np.hypot(x - 6.0, y - 2.0) < 0.7, -1.0, 0.0))
 
 
 def _crack(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.where(np.abs(x - 6.05) < 0.04, -1.0, 0.0) + 0 * y
+    return np.asarray(np.where(np.abs(x - 6.05) < 0.04, -1.0, 0.0) + 0 * y)
 
 
 @pytest.mark.parametrize("profile", BOTH)
