@@ -32,6 +32,8 @@ LONGEST_SUBSTEP_S = 0.02
 RELEASE_M = 0.02
 """Clearance beyond the radius at which contact ends."""
 _TOLERANCE = 1e-9
+_NO_FLOOR: Heights = np.zeros((0, 0), np.float32)
+_NO_FLOOR.setflags(write=False)  # as a world's floor: another kind of array would be another compilation
 
 # Columns of the kernel's state vector.
 _X, _Y, _YAW, _SPEED, _TURN, _SLIP_DISTANCE, _SLIP_TURN, _BLOCKED, _TOUCHING, _CONTACTS, _LOST = range(11)
@@ -83,7 +85,7 @@ class Robot:
         self, world: World, config: SimConfig, rng: np.random.Generator, scene: Scene | None = None
     ) -> None:
         self._scene = scene or Scene(world)
-        self._floor_m: Heights = np.zeros((0, 0), np.float32) if world.floor_m is None else world.floor_m
+        self._floor_m: Heights = _NO_FLOOR if world.floor_m is None else world.floor_m
         self._solid = body_solid(world, config.robot.height_m) if world.has_terrain else None
         self._body = body_parameters(config.robot, config.slope_slip_fraction)
         self._lost_speed_mps = config.contact_lost_speed_mps

@@ -39,7 +39,7 @@ from services.sim.lidar import Lidar
 from services.sim.robot import Robot, RobotState
 from services.sim.scene import Scene
 from services.sim.terrain import rotation
-from services.sim.world import World, with_start
+from services.sim.world import Door, Mover, World
 from services.sim.worlds import build_world
 
 __all__ = ["Config", "SimStage", "create", "spec", "warm_up"]
@@ -404,11 +404,13 @@ def world_picture(judge: Judge, now: Stamp) -> WorldPicture:
 
 
 def warm_up() -> None:
-    """Compile the kernels."""
+    """Compile the kernels: on flat ground with a person and a door, and on uneven ground."""
     grid = GridSpec(0.1, 0, 0, 40, 40)
-    world = with_start(
-        World("warm-up", grid, np.zeros(grid.shape, dtype=np.bool_), (0.0, 0.0, 0.0)), 2.0, 2.0
-    )
-    stage = SimStage(Config(), world, 0)
-    for k in range(3):
-        stage.step(k * STEP_NS, Inputs({}))
+    solid = np.zeros(grid.shape, dtype=np.bool_)
+    people, doors = (Mover((1.0, 1.0), (1.0, 3.0), 0.5),), (Door((3.0, 0.0, 3.1, 1.0), 0.1),)
+    flat = World("warm-up", grid, solid, (2.0, 2.0, 0.0), movers=people, doors=doors)
+    level = np.zeros(grid.shape, np.float32)
+    for world in (flat, World("warm-up", grid, solid, (2.0, 2.0, 0.0), level, level + np.float32(3.0))):
+        stage = SimStage(Config(), world, 0)
+        for k in range(4):
+            stage.step(k * STEP_NS, Inputs({}))

@@ -58,9 +58,15 @@ def height_at(heights_m: Heights, x: float, y: float) -> float:
     return low * (1.0 - b) + high * b
 
 
-@njit
 def resample(heights_m: Heights, cuts: int) -> Heights:
-    """Heights at the centres of cells cut `cuts` times finer; exact, as the surface is bilinear."""
+    """Heights at the centres of cells cut `cuts` times finer; exact, as the surface is bilinear. Read-only."""
+    finer = heights_m if cuts == 1 else _resample(heights_m, cuts)
+    finer.setflags(write=False)  # as the world's own: another kind of array would be another compilation
+    return finer
+
+
+@njit
+def _resample(heights_m: Heights, cuts: int) -> Heights:
     rows, columns = heights_m.shape
     finer = np.empty((rows * cuts, columns * cuts), dtype=np.float32)
     for row in range(rows * cuts):
