@@ -70,14 +70,11 @@ class Config(BaseModel):
         2.5, ge=0, le=20, description="A frontier this near to an old one is that one."
     )
     missed_rounds: int = Field(8, ge=0, le=1000, description="Rounds that a cut-off frontier is waited for.")
-    unknown_depth_m: float = Field(
-        0.5, ge=0, le=20, description="Unknown ground expected behind a border, m."
-    )
-    opening_min_m: float = Field(
-        0.3,
+    opening_min_m2: float = Field(
+        0.5,
         gt=0,
-        le=10,
-        description="A border on the unknown so long is always a frontier, m.",
+        le=100,
+        description="A border on so much unseen ground that the robot may enter is always a frontier, m2.",
     )
     unknown_max_gain: float = Field(
         3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats."

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.clusters import label_components
+from planning.clusters import component_centroids, label_components
 from planning.coverage import LOG_2
 from planning.grid import FREE, LETHAL, UNKNOWN
 from planning.kernels import njit
@@ -197,13 +197,14 @@ def find_frontiers(
     """The frontiers of a window with at least this gain: (x, y, expected information gain), in a fixed order.
 
     The uncovered ground is split into connected pieces; the border of a piece with covered ground is cut into blocks
-    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Ground that
-    is covered but borders on the unknown (the way around a corner) is open too: it counts what may lie behind.
+    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Where the
+    robot's centre can get to the border of ground never seen that it may well enter (the way around a corner; not a
+    gap in a ragged wall that its body does not fit), that is open too, and counts what ground may lie behind.
     """
     s = window.spec
     labels = np.zeros(s.shape, np.int32)
-    unknown = solid(window.unseen)
-    open_ground = window.uncovered | (window.ground & (window.state == FREE) & beside(unknown))
+    openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
+    open_ground = window.uncovered | openings
     pieces = label_components(open_ground, labels)
     if pieces == 0:
         return []
@@ -215,27 +216,21 @@ def find_frontiers(
         return []
     reach = round(config.frontier_reach_m / s.resolution_m)
     spread_blocks(open_ground, block, reach, blocks)
+    behind = np.zeros(s.shape, np.int32)
+    sizes = component_centroids(behind, label_components(window.hopeful, behind))[0]
     gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
-    block_gains(window.entropy, unknown, block, gain, sums, hidden)
-    unknown_gain = config.unknown_depth_m * s.resolution_m * LOG_2 / config.spacing_m**2
-    gain += np.minimum(hidden * unknown_gain, config.unknown_max_gain)
+    block_gains(window.entropy, behind, sizes, block, gain, sums, hidden)
+    hidden *= s.resolution_m**2
+    gain += np.minimum(hidden * LOG_2 / config.spacing_m**2, config.unknown_max_gain)
     places = block_places(window.reachable, block, sums, round(1.0 / s.resolution_m))
     piece_of = np.zeros(blocks, np.int64)
     inside = block >= 0
     piece_of[block[inside]] = labels[inside]
     least = config.frontier_min_gain if least is None else least
-    opening = hidden >= config.opening_min_m / s.resolution_m - 1e-9
+    opening = hidden >= config.opening_min_m2 - 1e-9
     # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
     gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
     return _select(gain, places, piece_of, window, least)
-
-
-def solid(unseen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Unseen cells in the midst of unseen cells (6 of 9): gaps between far rays are not unexplored ground."""
-    padded = np.pad(unseen, 1, mode="edge").astype(np.uint8)
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    kept: NDArray[np.bool_] = unseen & (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] >= 6)
-    return kept
 
 
 def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -354,15 +349,17 @@ def spread_blocks(uncovered: NDArray[np.bool_], block: NDArray[np.int32], reach:
 @njit
 def block_gains(
     entropy: NDArray[np.float32],
-    unknown: NDArray[np.bool_],
+    behind: NDArray[np.int32],
+    sizes: NDArray[np.int64],
     block: NDArray[np.int32],
     gain: NDArray[np.float64],
     sums: NDArray[np.float64],
     hidden: NDArray[np.float64],
 ) -> None:
-    """Entropy of each block's cells, and how many of them border on the unknown (hidden).
+    """Entropy of each block's cells, and the size of the largest piece of hopeful ground that they border on (hidden).
 
-    sums: (blocks, 3): number of cells, sum of rows, sum of columns.
+    behind: (h, w) labels of the pieces of hopeful ground, 0 elsewhere. sizes: cells of piece k + 1. sums: (blocks, 3):
+    number of cells, sum of rows, sum of columns.
     """
     height, width = block.shape
     for row in range(height):
@@ -374,14 +371,10 @@ def block_gains(
             sums[b, 0] += 1.0
             sums[b, 1] += row
             sums[b, 2] += column
-            near_unknown = (
-                (row > 0 and unknown[row - 1, column])
-                or (row < height - 1 and unknown[row + 1, column])
-                or (column > 0 and unknown[row, column - 1])
-                or (column < width - 1 and unknown[row, column + 1])
-            )
-            if near_unknown:
-                hidden[b] += 1.0
+            for d_row, d_column in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+                r, c = row + d_row, column + d_column
+                if r >= 0 and c >= 0 and r < height and c < width and behind[r, c] > 0:
+                    hidden[b] = max(hidden[b], float(sizes[behind[r, c] - 1]))
 
 
 @njit

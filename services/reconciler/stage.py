@@ -159,13 +159,11 @@ class ReconcilerStage:
         )
         if off > self._config.off_path_m:
             self._drop("off the path")
-        trouble = (
-            follower is not None
-            and follower.plan_id == self._plan_id
-            and (follower.blocked or follower.stuck)
-        )
+        trouble = follower is not None and (follower.blocked or follower.stuck)
+        # Only a follower that has the newest plan and is well ends the trouble: a new plan every second would, else.
         if not trouble:
-            self._trouble_ns = -1
+            if follower is None or follower.plan_id == self._plan_id:
+                self._trouble_ns = -1
         elif self._trouble_ns < 0:
             self._trouble_ns = now
         elif now - self._trouble_ns > self._config.blocked_s * SECOND_NS:
@@ -343,7 +341,8 @@ class ReconcilerStage:
         prefix = opened.prefix
         raw = np.concatenate([prefix, policy.path_xy_m[1:]]) if len(prefix) else policy.path_xy_m
         fixed = len(prefix) if opened.keeps_old else max(1, len(prefix) // 2)
-        points = smooth(raw, fixed, ground, self._config)
+        offset = len(raw) - len(policy.path_xy_m)
+        points = smooth(raw, fixed, ground, self._config, offset + looked_along(policy))
         lattice = np.concatenate([opened.kept_lattice, policy.path_lattice[1:].astype(np.int64)])
         anchors = policy.path_xy_m[policy.path_node_point[1:]]
         node_point = list(opened.kept_point)
@@ -423,6 +422,13 @@ class ReconcilerStage:
         state = unpack_snapshot(snapshot)
         self._episode, self._plan_id = int(state["episode"]), int(state["plan_id"]) + 1
         self._value_ratio = float(state["value_ratio"])
+
+
+def looked_along(policy: LocalPolicy) -> NDArray[np.int64]:
+    """Indices in the path's line of both ends of every step that a look hangs on."""
+    steps = np.flatnonzero(policy.path_look)
+    ends = np.unique(np.concatenate([np.maximum(steps - 1, 0), steps]))
+    return policy.path_node_point[ends].astype(np.int64)
 
 
 def _age_s(inputs: Inputs, topic: Topic[Message]) -> float | None:

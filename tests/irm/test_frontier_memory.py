@@ -12,8 +12,8 @@ from planning.coverage import LOG_2
 from planning.grid import FREE, LETHAL, UNKNOWN
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from services.irm.config import Config
-from services.irm.frontiers import Frontier, FrontierManager, beside, find_frontiers, least_gain, solid
-from services.irm.window import Window
+from services.irm.frontiers import Frontier, FrontierManager, beside, find_frontiers, least_gain
+from services.irm.window import Window, solid
 from tests.irm.worlds import Belief, room
 
 SECOND = 10**9
@@ -89,25 +89,22 @@ def test_covered_ground_at_the_edge_of_the_unseen_is_a_frontier_and_beside_a_wal
     assert len(found) == 1
     x, y, gain = found[0]
     assert 3.0 < x < 4.0 and 1.0 < y < 4.0
-    cells = 3.0 / RES
-    assert gain == pytest.approx(min(cells * 0.5 * RES * LOG_2, 3.0), rel=0.1)
+    assert gain == pytest.approx(scene.config.unknown_max_gain), "more than 4 m2 may lie behind"
 
 
-@pytest.mark.parametrize(("depth_m", "most", "gain"), [(20.0, 2.0, 2.0), (20.0, 1.0, 1.0), (0.0, 2.0, 0.4)])
-def test_the_unseen_counts_up_to_a_limit_and_at_least_as_an_opening(
-    depth_m: float, most: float, gain: float
-) -> None:
-    scene = Scene(unknown_depth_m=depth_m, unknown_max_gain=most, frontier_enough_gain=0.4)
+@pytest.mark.parametrize(("most", "gain"), [(2.0, 2.0), (1.0, 1.0), (0.1, 0.4)])
+def test_the_unseen_counts_up_to_a_limit_and_at_least_as_an_opening(most: float, gain: float) -> None:
+    scene = Scene(unknown_max_gain=most, frontier_enough_gain=0.4)
     scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
     assert [g for _, _, g in scene.find()] == [pytest.approx(gain)]
 
 
-@pytest.mark.parametrize(("width_m", "found"), [(0.2, 0), (0.6, 1), (1.0, 1)])
-def test_an_opening_that_is_wide_enough_is_a_frontier_however_large_the_world(
+@pytest.mark.parametrize(("width_m", "found"), [(0.2, 0), (0.4, 0), (0.8, 1), (1.2, 1)])
+def test_an_opening_that_the_robot_fits_is_a_frontier_however_large_the_world(
     width_m: float, found: int
 ) -> None:
-    """Nothing else is worth a trip in this world. Openings are of whole cells of 0.2 m; the least is 0.5 m."""
-    scene = Scene(opening_min_m=0.5, unknown_depth_m=0.0)
+    """A beam passes through each of them; the robot, 0.5 m wide, through the wider ones (whole cells of 0.2 m)."""
+    scene = Scene()
     scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
     scene.flat.fill(4.0, 0.8, 4.2, 4.2, LETHAL)
     scene.flat.fill(4.0, 2.4, 4.2, 2.4 + width_m, FREE)
@@ -116,7 +113,7 @@ def test_an_opening_that_is_wide_enough_is_a_frontier_however_large_the_world(
 
 
 def test_an_opening_out_of_sight_stays_a_frontier_when_the_known_ground_grows() -> None:
-    scene = Scene(unknown_depth_m=0.0)
+    scene = Scene(unknown_max_gain=0.1)
     scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
     scene.round(ground_m2=50.0)
     name = scene.only().node_id
