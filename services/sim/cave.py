@@ -23,7 +23,7 @@ LOWEST_CEILING_M = 0.4
 
 
 def cave(seed: int) -> World:
-    """A branching cave with loops: some 450 to 600 m of passage, 2 to 6 m wide, pinches, chambers, rough ground."""
+    """A branching cave with loops: some 550 to 600 m of passage, 2 to 6 m wide, pinches, chambers, rough ground."""
     rng = np.random.default_rng([seed, 103])
     nodes, passages = cave_plan(rng)
     spec = grid_around(passages, RESOLUTION_M, margin_m=2.0)

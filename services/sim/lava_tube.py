@@ -20,7 +20,7 @@ _POCKETS = 9
 
 
 def lava_tube(seed: int) -> World:
-    """One broad winding tube, 6 to 15 m wide and some 220 to 280 m long, with pockets at its sides."""
+    """One broad winding tube, 6 to 15 m wide and some 236 m long, with pockets at its sides."""
     rng = np.random.default_rng([seed, 104])
     passages = tube_plan(rng)
     spec = grid_around(passages, RESOLUTION_M, margin_m=2.0)

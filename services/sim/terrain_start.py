@@ -45,11 +45,18 @@ def with_terrain_start(
     world: World, x_m: float, y_m: float, yaw_rad: float | None, robot: RobotConfig
 ) -> World:
     """As `world.with_start`; also refuses ground on which the robot does not stand, and suggests the nearest."""
+    try:
+        placed = with_start(world, x_m, y_m, yaw_rad, robot.footprint_radius_m)
+    except StartError:
+        if not (
+            math.isfinite(x_m) and math.isfinite(y_m) and world.spec.contains(*world.spec.cell_of(x_m, y_m))
+        ):
+            raise
+        placed = None
     ground = standing_ground(world, robot)
-    row, column = world.spec.cell_of(x_m, y_m) if math.isfinite(x_m) and math.isfinite(y_m) else (-1, -1)
-    around = ground[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-    if not world.spec.contains(row, column) or around.any():
-        return with_start(world, x_m, y_m, yaw_rad, robot.footprint_radius_m)
+    row, column = world.spec.cell_of(x_m, y_m)
+    if placed is not None and ground[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3].any():
+        return placed
     if not ground.any():
         raise StartError(f"the robot can stand nowhere in world {world.name}")
     nearest = ndimage.distance_transform_edt(~ground, return_distances=False, return_indices=True)
