@@ -31,9 +31,9 @@ _LOST_GRACE_S = 5.0
 
 def world_name(config: Config) -> str:
     """The world or map that the simulator is told to use, for titles and results."""
-    map_file = config.sim.get("map_file")
-    if map_file:
-        return Path(str(map_file)).stem
+    for key in ("map_file", "mesh_file", "dem_file"):
+        if config.sim.get(key):
+            return Path(str(config.sim[key])).stem
     if "world" in config.sim:
         return str(config.sim["world"])
     model = service_config_class("sim")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from plgrim.commands.options import ConfigFile, OutFolder, Speed, put
+from plgrim.commands.options import ConfigFile, DemFile, MeshFile, OutFolder, Robot, Speed, put
 
 if TYPE_CHECKING:
     from plgrim.config import Config
@@ -32,6 +32,9 @@ def explore(
     map_file: Annotated[
         Path | None, typer.Option("--map", help="ROS map_server YAML file instead of a built-in world.")
     ] = None,
+    mesh: MeshFile = None,
+    dem: DemFile = None,
+    robot: Robot = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the world and of every random stream.")] = None,
     start: Annotated[
         tuple[float, float] | None, typer.Option(metavar="X Y", help="Start in the map's frame, m.")
@@ -42,14 +45,17 @@ def explore(
     out: OutFolder = Path("out/explore"),
     config_file: ConfigFile = None,
 ) -> None:
-    """Explore a world or a map until it is covered; exit 0 when it was."""
-    if world is not None and map_file is not None:
-        raise typer.BadParameter("--world and --map exclude each other")
+    """Explore a world, a map, a mesh or a height image until it is covered; exit 0 when it was."""
+    if sum(given is not None for given in (world, map_file, mesh, dem)) > 1:
+        raise typer.BadParameter("--world, --map, --mesh and --dem exclude each other")
     overrides: dict[str, Any] = {}
     put(overrides, "seed", seed)
     put(overrides, "clock.speed", speed)
     put(overrides, "sim.world", world)
     put(overrides, "sim.map_file", None if map_file is None else str(map_file.resolve()))
+    put(overrides, "sim.mesh_file", None if mesh is None else str(mesh.resolve()))
+    put(overrides, "sim.dem_file", None if dem is None else str(dem.resolve()))
+    put(overrides, "sim.robot.profile", robot)
     put(overrides, "sim.start", None if start is None else {"x_m": start[0], "y_m": start[1]})
     put(overrides, "mission.time_budget_s", time_budget)
     config = _prepare(config_file, overrides)

@@ -12,6 +12,15 @@ ConfigFile = Annotated[
     typer.Option("--config", "-c", help="YAML or TOML file; default: $PLGRIM_CONFIG, or the defaults."),
 ]
 OutFolder = Annotated[Path, typer.Option("--out", "-o", help="Result folder.")]
+MeshFile = Annotated[
+    Path | None,
+    typer.Option("--mesh", help="Mesh (OBJ, STL, PLY, DAE; metres, z up) instead of a built-in world."),
+]
+DemFile = Annotated[
+    Path | None,
+    typer.Option("--dem", help="Height image (npy, GeoTIFF, 16-bit PNG) instead of a built-in world."),
+]
+Robot = Annotated[str | None, typer.Option("--robot", help="Robot profile: husky or spot.")]
 Speed = Annotated[float | None, typer.Option(min=0.01, max=100, help="Mission seconds a wall second.")]
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from planning.robot_profile import PROFILES
 
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 
-_PROFILES: dict[str, dict[str, float]] = {
-    "husky": {"footprint_radius_m": 0.335, "max_speed_mps": 1.0, "height_m": 0.9},
-    "spot": {"footprint_radius_m": 0.25, "max_speed_mps": 1.0, "height_m": 0.9},
-}
+Tilt = Annotated[float, Field(gt=0.0, lt=1.5)]
 
 
 class _Model(BaseModel):
@@ -59,7 +59,11 @@ class CoverageSensorConfig(_Model):
 
 
 class RobotConfig(_Model):
-    """A ground robot with a disc for a footprint. `profile` sets the defaults of the other fields."""
+    """A ground robot with a disc for a footprint. `profile` sets the defaults of the other fields.
+
+    The limits of what it can stand are of the ground truth that breaks it; `planning.robot_profile` explains them.
+    On flat ground only the radius and the driving limits matter.
+    """
 
     profile: Literal["husky", "spot"] = "spot"
     footprint_radius_m: Positive = 0.25
@@ -69,13 +73,33 @@ class RobotConfig(_Model):
     max_turn_rate_radps: float = Field(default=1.5, gt=0.0, le=20.0)
     max_turn_acceleration_radps2: Positive = 3.0
     height_m: Positive = 0.9
+    """What hangs lower over the ground is a wall to it."""
+    length_m: Positive = 0.85
+    """Of the contact area: where its feet or wheels stand."""
+    width_m: Positive = 0.5
+    max_slope_rad: Tilt = 0.52
+    """The judge counts ground as reachable up to this slope over the disc."""
+    max_step_m: Positive = 0.20
+    """The judge counts ground as reachable up to this difference of height within 0.25 m."""
+    tip_roll_rad: Tilt = 0.70
+    tip_pitch_rad: Tilt = 0.79
+    max_climb_m: Positive = 0.32
+    """A higher ledge is met with the body: contact, as with a wall."""
+    max_drop_m: Positive = 0.40
+    """A foot over a higher ledge, downwards, and it has fallen: lost."""
+    belly_m: Positive = 0.35
+    """Ground that stands higher than this over the plane of its feet holds it up: lost."""
 
     @model_validator(mode="before")
     @classmethod
     def _fill_from_profile(cls, data: Any) -> Any:
-        if isinstance(data, dict):
-            return {**_PROFILES.get(str(data.get("profile", "spot")), {}), **data}
-        return data
+        if not isinstance(data, dict):
+            return data
+        profile = PROFILES.get(str(data.get("profile", "spot")))
+        if profile is None:
+            return data
+        filled = {key: value for key, value in asdict(profile).items() if key in cls.model_fields}
+        return {**filled, **data}
 
 
 class SlamConfig(_Model):
@@ -105,6 +129,15 @@ class SlamConfig(_Model):
     """Standard deviation of its yaw."""
 
 
+class ElevationConfig(_Model):
+    """How a height image is read; None: as its YAML file or its own tags say."""
+
+    resolution_m: float | None = Field(default=None, gt=0.0, le=50.0)
+    """Metres a pixel."""
+    height_scale_m: float | None = Field(default=None, gt=0.0, le=1000.0)
+    """Metres a unit of the pixels."""
+
+
 class Start(_Model):
     """Where the robot starts, in the frame of the world (map)."""
 
@@ -118,9 +151,16 @@ class SimConfig(_Model):
     """Everything the simulator needs; with the code and the mission's seed it fixes every byte of a run."""
 
     world: str = "subway_1x"
-    """Name of a built-in world (see `worlds.WORLD_NAMES`); not used when `map_file` is given."""
+    """Name of a built-in world (see `worlds.WORLD_NAMES`); not used when a file is given."""
     map_file: str | None = None
     """Path of a ROS map_server YAML file."""
+    mesh_file: str | None = None
+    """Path of a triangle mesh (OBJ, STL, PLY, DAE) in metres, z up."""
+    dem_file: str | None = None
+    """Path of a height image (npy, GeoTIFF, 16-bit PNG)."""
+    elevation: ElevationConfig = ElevationConfig()
+    raster_resolution_m: float = Field(default=0.2, ge=0.05, le=0.5)
+    """Cells of the raster that a mesh or a height image becomes."""
     seed: int = Field(default=0, ge=0, lt=2**63)
     """Of the built-in world; noise comes from the seed of the mission."""
     start: Start | None = None
@@ -133,5 +173,14 @@ class SimConfig(_Model):
     """Standard deviation of the relative error of distance and of turn."""
     slip_correlation_s: Positive = 1.0
     """How long slip stays alike. Independent noise every step would average away."""
+    slope_slip_fraction: float = Field(default=0.1, ge=0.0, le=1.0)
+    """On a slope of tangent t the robot makes 1 - fraction t of the way uphill, and drifts fraction t of it down."""
     contact_lost_speed_mps: Positive = 0.5
     """Contact at more than this speed into a wall breaks the robot: it is lost."""
+
+    @model_validator(mode="after")
+    def _one_file(self) -> Self:
+        given = [n for n in ("map_file", "mesh_file", "dem_file") if getattr(self, n) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} exclude each other")
+        return self

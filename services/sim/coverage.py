@@ -8,6 +8,9 @@ robot's own contact test, and not to their cells' centres.
 The disc's centre is tried on cell centres only: a passage wider than the footprint by less than one cell may
 count as closed, never a narrower one as open. Worlds coarser than 0.1 m are judged on cells cut to 0.1 m
 or less, so that a gap of two coarse cells is not lost between their centres.
+
+On uneven ground the configuration space is where the robot stands at acceptable risk (`terrain_judge`), and the line
+of sight is in three dimensions.
 """
 
 from __future__ import annotations
@@ -19,8 +22,10 @@ from numpy.typing import NDArray
 
 from planning.grid import GridSpec
 from planning.kernels import njit
-from services.sim.config import CoverageSensorConfig
+from services.sim.config import CoverageSensorConfig, LidarConfig, RobotConfig
 from services.sim.geometry import configuration_space, dilate, disc_holds_centre, flood, sees_cell
+from services.sim.terrain import Heights, body_solid, finite_ceiling, height_at, resample
+from services.sim.terrain_judge import acceptable_ground, look_over
 from services.sim.world import StartError, World
 
 COARSEST_CELL_M = 0.1
@@ -34,9 +39,29 @@ class Judge:
     probability is a matter of belief; here every look counts.
     """
 
-    def __init__(self, world: World, footprint_radius_m: float, sensor: CoverageSensorConfig) -> None:
+    def __init__(
+        self,
+        world: World,
+        footprint_radius_m: float,
+        sensor: CoverageSensorConfig,
+        robot: RobotConfig | None = None,
+        sensor_height_m: float = LidarConfig().height_m,
+    ) -> None:
+        self._world = world
+        self._radius_m = footprint_radius_m
+        self._cuts = cuts_of(world)
         self.spec, self.occupied = refine(world)
-        self.reachable = reachable_ground(self.spec, self.occupied, world.start, footprint_radius_m)
+        self._sensor_height_m = sensor_height_m
+        self._floor_m: Heights | None = None
+        if world.floor_m is not None and world.ceiling_m is not None:
+            self._floor_m = resample(world.floor_m, self._cuts)
+            self._ceiling_m = resample(finite_ceiling(world.ceiling_m), self._cuts)
+            robot = robot or RobotConfig(footprint_radius_m=footprint_radius_m)
+            solid = cut(body_solid(world, robot.height_m), self._cuts)
+            free = acceptable_ground(self.spec, solid, self._floor_m, robot)
+            self.reachable = reachable_part(self.spec, free, world.start, footprint_radius_m)
+        else:
+            self.reachable = reachable_ground(self.spec, self.occupied, world.start, footprint_radius_m)
         """bool[height, width] on `spec`: ground that the footprint can sweep over."""
         self.covered = np.zeros(self.spec.shape, dtype=np.bool_)
         """bool[height, width] on `spec`: reachable ground seen so far."""
@@ -56,9 +81,34 @@ class Judge:
         low_x, low_y, high_x, high_y = self._box or (x, y, x, y)
         self._box = (min(low_x, x), min(low_y, y), max(high_x, x), max(high_y, y))
         view = np.array([x, y, math.cos(yaw_rad), math.sin(yaw_rad)])
-        new = look(self.occupied, self._pending, self.covered, view, self._range_cells, self._cos_half_fov)
+        if self._floor_m is None:
+            new = look(
+                self.occupied, self._pending, self.covered, view, self._range_cells, self._cos_half_fov
+            )
+        else:
+            view = np.append(view, height_at(self._floor_m, x, y) + self._sensor_height_m)
+            new = look_over(
+                self.occupied, self._floor_m, self._ceiling_m, self._pending, self.covered, view,
+                self._range_cells, self._cos_half_fov,
+            )  # fmt: skip
         self._covered_cells += new
         return new
+
+    def close(self, occupied: NDArray[np.bool_], robot_m: tuple[float, float]) -> None:
+        """Take over new walls (on the world's cells) after a door has closed, with the robot at a point.
+
+        What has been covered still counts; ground not yet covered that the robot can no longer reach does not.
+        """
+        walls = cut(occupied, self._cuts)
+        still = reachable_ground(self.spec, walls, (*robot_m, 0.0), self._radius_m)
+        self.take_over(occupied, self.reachable & (self.covered | still))
+
+    def take_over(self, occupied: NDArray[np.bool_], reachable: NDArray[np.bool_]) -> None:
+        """Judge by these walls (on the world's cells) and this ground; what is covered of it stays covered."""
+        self.occupied = cut(occupied, self._cuts)
+        self.reachable = reachable
+        self._reachable_cells = int(np.count_nonzero(reachable))
+        self.set_covered(self.covered)
 
     @property
     def coverage_fraction(self) -> float:
@@ -103,18 +153,29 @@ class Judge:
         self._covered_cells = int(np.count_nonzero(self.covered))
 
 
+def cuts_of(world: World) -> int:
+    """Into how many along a side each cell of the world is cut, so that none is over `COARSEST_CELL_M`."""
+    return max(1, math.ceil(world.spec.resolution_m / COARSEST_CELL_M - 1e-6))
+
+
+def cut(mask: NDArray[np.bool_], cuts: int) -> NDArray[np.bool_]:
+    """The mask with each cell cut into cuts x cuts; read-only."""
+    if cuts == 1:
+        return mask
+    finer = np.repeat(np.repeat(mask, cuts, axis=0), cuts, axis=1)
+    finer.setflags(write=False)  # as the world's own: another kind of array would be another compilation
+    return finer
+
+
 def refine(world: World) -> tuple[GridSpec, NDArray[np.bool_]]:
     """The world on cells of at most `COARSEST_CELL_M`: each cell cut into k x k."""
-    spec = world.spec
-    cuts = max(1, math.ceil(spec.resolution_m / COARSEST_CELL_M - 1e-6))
+    spec, cuts = world.spec, cuts_of(world)
     if cuts == 1:
         return spec, world.occupied
     finer = GridSpec(
         spec.resolution_m / cuts, spec.ix0 * cuts, spec.iy0 * cuts, spec.width * cuts, spec.height * cuts
     )
-    occupied = np.repeat(np.repeat(world.occupied, cuts, axis=0), cuts, axis=1)
-    occupied.setflags(write=False)  # as the world's own: another kind of array would be another compilation
-    return finer, occupied
+    return finer, cut(world.occupied, cuts)
 
 
 def reachable_ground(
@@ -124,10 +185,16 @@ def reachable_ground(
 
     Raises StartError if the disc fits on no cell next to the start.
     """
-    radius_cells = footprint_radius_m / spec.resolution_m
-    free = configuration_space(occupied, radius_cells)
+    free = configuration_space(occupied, footprint_radius_m / spec.resolution_m)
+    return reachable_part(spec, free, start, footprint_radius_m)
+
+
+def reachable_part(
+    spec: GridSpec, free: NDArray[np.bool_], start: tuple[float, float, float], footprint_radius_m: float
+) -> NDArray[np.bool_]:
+    """What the disc sweeps while its centre roams the part of `free` that holds the start. Raises StartError."""
     row, column = _nearest_free(spec, free, start)
-    return dilate(flood(free, row, column), disc_holds_centre(radius_cells), False)
+    return dilate(flood(free, row, column), disc_holds_centre(footprint_radius_m / spec.resolution_m), False)
 
 
 def _nearest_free(
@@ -144,7 +211,8 @@ def _nearest_free(
     ]
     if not around:
         raise StartError(
-            f"the footprint does not fit at the start ({start[0]:g}, {start[1]:g}): choose another"
+            f"the footprint does not fit at the start ({start[0]:g}, {start[1]:g}), or the ground is too rough: "
+            f"choose another"
         )
     _, row, column = min(around)
     return row, column

@@ -37,8 +37,10 @@ from services.sim.follower import Command, Follower, TimedPath
 from services.sim.follower import FollowerState as FollowerMemory
 from services.sim.lidar import Lidar
 from services.sim.robot import Robot, RobotState
+from services.sim.scene import Scene
 from services.sim.slam import Slam
-from services.sim.world import World, with_start
+from services.sim.terrain import rotation
+from services.sim.world import Door, Mover, World
 from services.sim.worlds import build_world
 
 __all__ = ["Config", "SimStage", "create", "spec", "warm_up"]
@@ -74,15 +76,19 @@ class SimStage:
 
     def __init__(self, config: Config, world: World, seed: int) -> None:
         self._config, self._world, self._seed = config, world, seed
-        self._robot = Robot(world, config, stream(seed, "sim", "slip"))
-        self._lidar = Lidar(world, config.lidar)
-        self._judge = Judge(world, config.robot.footprint_radius_m, config.coverage_sensor)
+        self._scene = Scene(world)
+        self._robot = Robot(world, config, stream(seed, "sim", "slip"), self._scene)
+        self._lidar = Lidar(world, config.lidar, self._scene)
+        robot = config.robot
+        self._judge = Judge(
+            world, robot.footprint_radius_m, config.coverage_sensor, robot, config.lidar.height_m
+        )
         self._follower = Follower(config.robot)
         self._command = _STANDING
         self._plan = (0, 0, False)
         """plan_id, stamp and whether it can be driven, of the newest plan."""
         self._estimate = Planar(*world.start)
-        self._slam = Slam(config.slam, self._estimate, 0.0, stream(seed, "sim", "drift"))
+        self._slam = Slam(config.slam, self._estimate, self._robot.state.z_m, stream(seed, "sim", "drift"))
         self._tick, self._last_ns = 0, -1
         self._distance_m = 0.0
         self._blocked, self._ended, self._told_lost = False, False, False
@@ -94,6 +100,7 @@ class SimStage:
         """Drive until now, then read the newest plan, and publish what is due."""
         noise = stream(self._seed, "sim", "slam", self._tick)
         self._robot.rng = stream(self._seed, "sim", "slip", self._tick)
+        self._move_scene(now / SECOND_NS)
         self._drive(now, noise)
         self._read_plan(now, inputs)
         self._estimate = self._noisy_pose(noise)
@@ -130,8 +137,15 @@ class SimStage:
             before = self._robot.state
             after = self._robot.step(self._command.speed_mps, self._command.turn_rate_radps, duration_s)
             self._distance_m += math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
-            self._slam.move(Planar(after.x_m, after.y_m, after.yaw_rad), 0.0, drift)
+            self._slam.move(Planar(after.x_m, after.y_m, after.yaw_rad), after.z_m, drift)
             self._blocked |= after.blocked
+
+    def _move_scene(self, now_s: float) -> None:
+        """People walk and doors close."""
+        state, radius_m = self._robot.state, self._config.robot.footprint_radius_m
+        at = (state.x_m, state.y_m)
+        if self._scene.advance(now_s, at, radius_m):
+            self._judge.close(self._scene.occupied, at)
 
     def _follow(self, now_s: float) -> Command:
         return self._follower.step(*self._estimate, now_s, self._blocked)
@@ -177,9 +191,18 @@ class SimStage:
         self._slots[what] = slot
         return True
 
-    def _pose(self, z_m: float = 0.0) -> Pose:
-        """The estimated pose at a height."""
-        return Pose(x_m=self._estimate.x_m, y_m=self._estimate.y_m, z_m=z_m, yaw_rad=self._estimate.yaw_rad)
+    def _pose(self, above_m: float = 0.0) -> Pose:
+        """The estimated pose, so far along the body's up axis; height and attitude are the true ones."""
+        state, at = self._robot.state, self._estimate
+        up = rotation(state.roll_rad, state.pitch_rad, at.yaw_rad)[:, 2] * above_m
+        return Pose(
+            x_m=at.x_m + float(up[0]),
+            y_m=at.y_m + float(up[1]),
+            z_m=state.z_m + float(up[2]),
+            yaw_rad=at.yaw_rad,
+            roll_rad=state.roll_rad,
+            pitch_rad=state.pitch_rad,
+        )
 
     def _odometry(self, now: Stamp) -> Odometry:
         state, frame = self._robot.state, self._slam.map_to_odom
@@ -204,10 +227,15 @@ class SimStage:
         )
 
     def _cloud(self, now: Stamp) -> PointCloud:
-        points_m = self._lidar.scan(*self._robot.state[:3], stream(self._seed, "sim", "lidar", self._tick))
-        lidar = self._config.lidar
+        state, lidar = self._robot.state, self._config.lidar
+        noise = stream(self._seed, "sim", "lidar", self._tick)
+        points_m = self._lidar.scan(*state[:3], noise, state.z_m, state.roll_rad, state.pitch_rad)
         return PointCloud(
-            stamp_ns=now, sensor_in_odom=self._pose(lidar.height_m), range_m=lidar.range_m, points_m=points_m
+            stamp_ns=now,
+            sensor_in_odom=self._pose(lidar.height_m),
+            ground_z_m=state.z_m,
+            range_m=lidar.range_m,
+            points_m=points_m,
         )
 
     def _coverage_scan(self, now: Stamp) -> CoverageScan:
@@ -251,18 +279,24 @@ class SimStage:
 
     def _report(self, now: Stamp) -> JudgeReport:
         state, judge = self._robot.state, self._judge
-        faster_mps = self._config.contact_lost_speed_mps
         return JudgeReport(
             stamp_ns=now,
             world=self._world.name,
-            true_pose=Pose(x_m=state.x_m, y_m=state.y_m, yaw_rad=state.yaw_rad),
+            true_pose=Pose(
+                x_m=state.x_m,
+                y_m=state.y_m,
+                z_m=state.z_m,
+                yaw_rad=state.yaw_rad,
+                roll_rad=state.roll_rad,
+                pitch_rad=state.pitch_rad,
+            ),
             coverage=judge.coverage_fraction,
             covered_area_m2=judge.covered_area_m2,
             reachable_area_m2=judge.reachable_area_m2,
             distance_m=self._distance_m,
             contacts=state.contacts,
             lost=state.lost,
-            lost_reason=f"ran into a wall at more than {faster_mps:g} m/s" if state.lost else "",
+            lost_reason=self._robot.lost_reason,
         )
 
     # --- snapshots --------------------------------------------------------------------------------------------
@@ -274,9 +308,10 @@ class SimStage:
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot of a stage with the same configuration and seed."""
         state = unpack_snapshot(snapshot)
-        cells = self._judge.spec.width * self._judge.spec.height
-        covered = np.unpackbits(state["covered"], count=cells).astype(np.bool_)
-        self._judge.set_covered(covered.reshape(self._judge.spec.shape))
+        self._take_doors(state)
+        spec = self._judge.spec
+        covered = np.unpackbits(state["covered"], count=spec.width * spec.height).astype(np.bool_)
+        self._judge.set_covered(covered.reshape(spec.shape))
         self._set_beside_judge(state)
 
     def journal(self, outputs: Outputs) -> bytes:
@@ -290,6 +325,7 @@ class SimStage:
     def replay(self, record: bytes) -> None:
         """Take in a record of the journal."""
         state = unpack_snapshot(record)
+        self._take_doors(state)
         self._judge.add_covered(state["new"])
         self._set_beside_judge(state)
 
@@ -302,6 +338,8 @@ class SimStage:
             "command": list(self._command),
             "plan": list(self._plan),
             "estimate": list(self._estimate),
+            "closed": self._scene.closed,
+            "reachable": np.packbits(self._judge.reachable) if any(self._scene.closed) else None,
             "slam": self._slam.state(),
             "clock": [self._tick, self._last_ns],
             "distance_m": self._distance_m,
@@ -309,6 +347,15 @@ class SimStage:
             "slots": self._slots,
             "bad_plans": self.bad_plans,
         }
+
+    def _take_doors(self, state: dict[str, Any]) -> None:
+        """Doors that have closed, and what the judge has made of that."""
+        if state["reachable"] is None or list(state["closed"]) == list(self._scene.closed):
+            return
+        self._scene.set_closed(state["closed"])
+        spec = self._judge.spec
+        reachable = np.unpackbits(state["reachable"], count=spec.width * spec.height).astype(np.bool_)
+        self._judge.take_over(self._scene.occupied, reachable.reshape(spec.shape))
 
     def _set_beside_judge(self, state: dict[str, Any]) -> None:
         self._robot.state = RobotState(*state["robot"])
@@ -356,11 +403,13 @@ def world_picture(judge: Judge, now: Stamp) -> WorldPicture:
 
 
 def warm_up() -> None:
-    """Compile the kernels."""
+    """Compile the kernels: on flat ground with a person and a door, and on uneven ground."""
     grid = GridSpec(0.1, 0, 0, 40, 40)
-    world = with_start(
-        World("warm-up", grid, np.zeros(grid.shape, dtype=np.bool_), (0.0, 0.0, 0.0)), 2.0, 2.0
-    )
-    stage = SimStage(Config(), world, 0)
-    for k in range(3):
-        stage.step(k * STEP_NS, Inputs({}))
+    solid = np.zeros(grid.shape, dtype=np.bool_)
+    people, doors = (Mover((1.0, 1.0), (1.0, 3.0), 0.5),), (Door((3.0, 0.0, 3.1, 1.0), 0.1),)
+    flat = World("warm-up", grid, solid, (2.0, 2.0, 0.0), movers=people, doors=doors)
+    level = np.zeros(grid.shape, np.float32)
+    for world in (flat, World("warm-up", grid, solid, (2.0, 2.0, 0.0), level, level + np.float32(3.0))):
+        stage = SimStage(Config(), world, 0)
+        for k in range(4):
+            stage.step(k * STEP_NS, Inputs({}))

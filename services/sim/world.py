@@ -1,9 +1,9 @@
-"""A world: walls on flat ground, and where the robot starts in it."""
+"""A world: walls on flat or uneven ground, perhaps under a ceiling, and where the robot starts in it."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,24 +27,66 @@ class UnknownWorldError(WorldError):
 
 
 class MapFileError(WorldError):
-    """A map_server YAML file, one of its fields or its image is unusable."""
+    """A file with a map, a mesh or heights, one of its fields or its image is unusable."""
 
 
 class StartError(WorldError):
     """The robot cannot stand where it should start."""
 
 
+@dataclass(frozen=True)
+class Mover:
+    """A person who walks to and fro between two points, a standing cylinder; all as a function of mission time."""
+
+    from_m: tuple[float, float]
+    to_m: tuple[float, float]
+    speed_mps: float
+    radius_m: float = 0.3
+    height_m: float = 1.7
+
+    def at(self, now_s: float) -> tuple[float, float]:
+        """(x_m, y_m) of its centre."""
+        length_m = math.hypot(self.to_m[0] - self.from_m[0], self.to_m[1] - self.from_m[1])
+        way_m = math.fmod(self.speed_mps * max(now_s, 0.0), 2.0 * length_m)
+        share = min(way_m, 2.0 * length_m - way_m) / length_m
+        return (
+            self.from_m[0] + share * (self.to_m[0] - self.from_m[0]),
+            self.from_m[1] + share * (self.to_m[1] - self.from_m[1]),
+        )
+
+
+@dataclass(frozen=True)
+class Door:
+    """A rectangle (x_low, y_low, x_high, y_high) in metres that turns solid for good at a mission time.
+
+    A door waits while the robot stands in it.
+    """
+
+    area_m: tuple[float, float, float, float]
+    closes_at_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class World:
-    """Walls of `WALL_HEIGHT_M` on flat ground at z = 0; whatever lies outside the grid is wall.
+    """Walls, and the ground between them; whatever lies outside the grid is wall.
 
-    `occupied` is bool[height, width] on `spec`. `start` is (x_m, y_m, yaw_rad) in the frame `map`.
+    `occupied` is bool[height, width] on `spec`: solid. `start` is (x_m, y_m, yaw_rad) in the frame `map`.
+    `floor_m`, `ceiling_m` are float32[height, width]: heights at the cells' centres, bilinear between them, so that
+    the ground is a continuous surface; a ledge is one cell wide. The ceiling is inf where it is open. Cells that are
+    occupied take the heights of the nearest free ones. Both None: flat ground at z = 0 under an open sky, with walls
+    of `WALL_HEIGHT_M`; with a floor, walls have no end.
+    `open_border`: nothing stands outside, so that rays which leave the grid do not return.
     """
 
     name: str
     spec: GridSpec
     occupied: NDArray[np.bool_]
     start: tuple[float, float, float]
+    floor_m: NDArray[np.float32] | None = None
+    ceiling_m: NDArray[np.float32] | None = None
+    movers: tuple[Mover, ...] = ()
+    doors: tuple[Door, ...] = ()
+    open_border: bool = False
 
     def __post_init__(self) -> None:
         if self.occupied.shape != self.spec.shape or self.occupied.dtype != np.bool_:
@@ -52,9 +94,33 @@ class World:
                 f"world {self.name}: occupied is {self.occupied.dtype}{self.occupied.shape}, "
                 f"must be bool{self.spec.shape}"
             )
-        frozen = np.ascontiguousarray(self.occupied).view()
-        frozen.setflags(write=False)
-        object.__setattr__(self, "occupied", frozen)
+        self._set("occupied", np.ascontiguousarray(self.occupied).view())
+        if self.floor_m is None:
+            if self.ceiling_m is not None:
+                raise WorldError(f"world {self.name}: has a ceiling but no floor: give floor_m too")
+            return
+        ceiling = np.full(self.spec.shape, np.inf, np.float32) if self.ceiling_m is None else self.ceiling_m
+        for what, heights in (("floor_m", self.floor_m), ("ceiling_m", ceiling)):
+            if heights.shape != self.spec.shape or heights.dtype != np.float32:
+                raise WorldError(
+                    f"world {self.name}: {what} is {heights.dtype}{heights.shape}, must be float32{self.spec.shape}"
+                )
+            self._set(what, _filled(heights, self.occupied))
+        self._check_heights()
+
+    def _set(self, field: str, values: NDArray[np.generic]) -> None:
+        values.setflags(write=False)
+        object.__setattr__(self, field, values)
+
+    def _check_heights(self) -> None:
+        assert self.floor_m is not None and self.ceiling_m is not None
+        if not np.isfinite(self.floor_m).all() or np.isnan(self.ceiling_m).any():
+            raise WorldError(f"world {self.name}: a free cell has no height: mark it as occupied")
+
+    @property
+    def has_terrain(self) -> bool:
+        """Whether the ground has heights."""
+        return self.floor_m is not None
 
     def to_cells(self, x_m: float, y_m: float) -> tuple[float, float]:
         """(x, y) of a point in cells from the grid's lower left corner, as the kernels take it."""
@@ -116,7 +182,15 @@ def with_start(
             f"the nearest wall is {room_m:.2f} m away: {_suggestion(world)}"
         )
     yaw_rad = world.longest_ray_yaw(x_m, y_m) if yaw_rad is None else math.remainder(yaw_rad, 2.0 * math.pi)
-    return World(world.name, world.spec, world.occupied, (x_m, y_m, yaw_rad))
+    return replace(world, start=(x_m, y_m, yaw_rad))
+
+
+def _filled(heights_m: NDArray[np.float32], occupied: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Heights with those of the nearest free cell where occupied, so that nothing leaps at a wall."""
+    if occupied.all() or not occupied.any():
+        return np.array(heights_m)
+    nearest = ndimage.distance_transform_edt(occupied, return_distances=False, return_indices=True)
+    return np.ascontiguousarray(heights_m[tuple(nearest)])
 
 
 def _suggestion(world: World) -> str:
