@@ -89,13 +89,15 @@ class LocalPolicy(Message):
 
     root_value: of the policy at the junction; rollout_value: of the rollout rule alone, in the same model.
     path_*: the most likely branch from the junction: nodes (lattice indices, so that it keeps its meaning when the
-    window rolls), the expected reward of each step, and whether the tree or its rollout gave it. path_xy_m with
+    window rolls), the expected reward of the step into each (0 for the first), whether the tree or its rollout gave it,
+    and whether a look hangs on it (path_look: driving another line would lose what it is made for). path_xy_m with
     path_node_point: the driven line, and the index of each node's point in it. tree_*: the policy with its observation
     branches: action (0..7 moves, 8.. macro), value, visits; children of tree node m:
     child_node[child_start[m]:child_start[m + 1]] under child_observation.
     """
 
     schema_name: ClassVar[str] = "local_policy"
+    schema_version: ClassVar[int] = 2
 
     episode: int = Field(ge=1)
     irm_version: int = Field(ge=1)
@@ -110,6 +112,7 @@ class LocalPolicy(Message):
     path_lattice: Annotated[Array, column("int32", "p", 2)]
     path_reward: Annotated[Array, column("float64", "p")]
     path_in_tree: Annotated[Array, column("uint8", "p", maximum=1)]
+    path_look: Annotated[Array, column("uint8", "p", maximum=1)]
     path_xy_m: Annotated[Array, column("float64", "q", 2)]
     path_node_point: Annotated[Array, column("int32", "p", minimum=0)]
     tree_action: Annotated[Array, column("int32", "m", minimum=-1)]

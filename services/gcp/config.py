@@ -16,6 +16,9 @@ class Config(BaseModel):
     latency_s: float = Field(0.05, ge=0, le=10, description="Lock-step: time that a step takes, s.")
     reward: RewardWeights = RewardWeights()
     particles: int = Field(32, ge=1, le=4096, description="Samples of the robot's pose: the belief b(q).")
+    max_pose_spread_m: float = Field(
+        0.5, ge=0, le=20, description="Deviation of the pose among the nodes around it, at most, m."
+    )
     switch_margin_relative: float = Field(
         2.0, ge=0, le=10, description="The target is left for one whose Q is better by this share of |Q|, and"
     )

@@ -102,6 +102,8 @@ class GcpStage:
         mean = np.array(_robot_xyz(odometry))
         covariance = np.asarray(odometry.covariance)[:2, :2]
         variance, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
+        # The breadcrumbs around drift along with the robot: its place among them is better known than that in `map`.
+        variance = np.minimum(variance, self.config.max_pose_spread_m**2)
         spread = rng.standard_normal((self.config.particles, 2)) * np.sqrt(np.maximum(variance, 0.0))
         xyz = np.tile(mean, (self.config.particles, 1))
         xyz[:, :2] += spread @ axes.T
@@ -232,6 +234,16 @@ class GcpStage:
         target, x_m, y_m, z_m = state["target"]
         self._target = _Target(target, (x_m, y_m, z_m))
         self._tick, self._asked_ns = state["tick"], state["asked_ns"]
+
+    def journal(self, outputs: Outputs) -> bytes:
+        """The target held; the graph comes again from irm."""
+        return pack_snapshot({"target": [self._target.id, *self._target.xyz_m], "tick": self._tick})
+
+    def replay(self, record: bytes) -> None:
+        """Take in a record of the journal."""
+        state = unpack_snapshot(record)
+        target, x_m, y_m, z_m = state["target"]
+        self._target, self._tick = _Target(target, (x_m, y_m, z_m)), state["tick"]
 
 
 def _robot_xyz(odometry: Odometry) -> tuple[float, float, float]:

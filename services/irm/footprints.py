@@ -41,6 +41,7 @@ class FootprintStore:
     def __init__(self, coverage: TileLayer) -> None:
         self._coverage = coverage
         self._footprints: dict[int, _Footprint] = {}
+        self._changed: set[int] = set()
 
     def add(
         self,
@@ -70,6 +71,8 @@ class FootprintStore:
         new = np.zeros(held.spec.shape, dtype=np.bool_)
         new[common[0]] = seen[common[1]] & ~held.seen[common[0]]
         held.seen |= new
+        if new.any():
+            self._changed.add(scan.keyframe_id)
         self._add_evidence(held.spec, new, held.log_odds)
         return int(new.sum())
 
@@ -102,24 +105,52 @@ class FootprintStore:
             change = pose.compose(held.pose.inverse())
             spec, seen = _moved(held.spec, held.seen, change)
             self._footprints[keyframe_id] = _Footprint(pose, spec, seen, held.log_odds)
+            self._changed.add(keyframe_id)
             self._add_evidence(spec, seen, held.log_odds)
             moved += 1
         return moved
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
-        return {
-            str(k): [list(f.pose), list(f.spec), np.packbits(f.seen), f.log_odds]
-            for k, f in sorted(self._footprints.items())
-        }
+        return {str(k): _pack(f) for k, f in sorted(self._footprints.items())}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """From a snapshot."""
-        self._footprints = {}
-        for key, (pose, spec_fields, packed, log_odds) in state.items():
-            spec = GridSpec(*spec_fields)
-            seen = np.unpackbits(packed, count=spec.width * spec.height).astype(np.bool_).reshape(spec.shape)
-            self._footprints[int(key)] = _Footprint(Planar(*pose), spec, seen, float(log_odds))
+        """From a snapshot, with the coverage layer as it was then."""
+        self._footprints = {int(key): _unpack(packed) for key, packed in state.items()}
+
+    def take_changes(self) -> dict[str, Any]:
+        """The footprints that have changed since the last call: for the journal."""
+        changed, self._changed = self._changed, set()
+        return {str(k): _pack(self._footprints[k]) for k in sorted(changed)}
+
+    def apply_changes(self, changes: dict[str, Any]) -> None:
+        """Take in changes from the journal: footprints and what they add to the coverage."""
+        for key, packed in changes.items():
+            self._footprints[int(key)] = self._replace(self._footprints.get(int(key)), _unpack(packed))
+
+    def _replace(self, old: _Footprint | None, new: _Footprint) -> _Footprint:
+        """Only the difference is counted when the keyframe has not moved: sums of evidence stay exact."""
+        fresh = new.seen.copy()
+        if old is not None and old.pose == new.pose:
+            common = overlap(new.spec, old.spec)
+            assert common is not None  # footprints only grow
+            fresh[common[0]] &= ~old.seen[common[1]]
+        elif old is not None:
+            self._add_evidence(old.spec, old.seen, -old.log_odds)
+        self._add_evidence(new.spec, fresh, new.log_odds)
+        return new
+
+
+def _pack(footprint: _Footprint) -> list[Any]:
+    f = footprint
+    return [list(f.pose), list(f.spec), np.packbits(f.seen), f.log_odds]
+
+
+def _unpack(packed: list[Any]) -> _Footprint:
+    pose, spec_fields, bits, log_odds = packed
+    spec = GridSpec(*spec_fields)
+    seen = np.unpackbits(bits, count=spec.width * spec.height).astype(np.bool_).reshape(spec.shape)
+    return _Footprint(Planar(*pose), spec, seen, float(log_odds))
 
 
 def _look(

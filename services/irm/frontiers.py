@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.clusters import label_components
+from planning.clusters import component_centroids, label_components
 from planning.coverage import LOG_2
 from planning.grid import FREE, LETHAL, UNKNOWN
 from planning.kernels import njit
@@ -36,17 +36,30 @@ class Frontier:
     isolated: int = 0
     pursued_s: float = 0.0
     nearest_m: float = math.inf
+    again: bool = False
+    opening: bool = False
+    rounds: int = 0
+
+
+class Found(NamedTuple):
+    """A frontier as it is found in a window. opening: mostly for what may lie behind the edge of the unseen."""
+
+    x_m: float
+    y_m: float
+    gain: float
+    opening: bool
 
 
 @dataclass(slots=True)
 class GivenUp:
-    """A frontier that was given up, why, and when it may come back."""
+    """A frontier that was given up, why, when it may come back, and whether it has come back before."""
 
     x_m: float
     y_m: float
     gain: float
     reason: str
     until_ns: int
+    again: bool = False
 
 
 @dataclass(slots=True)
@@ -67,6 +80,7 @@ class FrontierManager:
         ground_m2: float = 0.0,
     ) -> int:
         """Look at the window again. elapsed_s: since the last call; ground_m2: known so far. Returns the next id."""
+        next_id = self._second_chances(next_id)
         self.given_up = [g for g in self.given_up if g.until_ns > now_ns]
         least = least_gain(self.config, ground_m2)
         found = [f for f in find_frontiers(window, self.config, least) if not self._is_given_up(f[0], f[1])]
@@ -82,19 +96,30 @@ class FrontierManager:
             frontier = self.frontiers[node_id]
             if math.hypot(found[index][0] - frontier.x_m, found[index][1] - frontier.y_m) > 0.5:
                 frontier.beside_s, frontier.pursued_s, frontier.nearest_m = 0.0, 0.0, math.inf
-            frontier.x_m, frontier.y_m, frontier.gain = found[index]
+            frontier.x_m, frontier.y_m, frontier.gain, frontier.opening = found[index]
             frontier.seen, frontier.missed = True, 0
+            frontier.rounds += 1
         for frontier in inside:
             if not frontier.seen:
-                self._miss(frontier, window, now_ns)
-        for index, (x, y, gain) in enumerate(found):
+                self._miss(frontier, window, robot, now_ns)
+        for index, (x, y, gain, opening) in enumerate(found):
             if index not in taken:
-                self.frontiers[next_id] = Frontier(next_id, x, y, gain)
+                self.frontiers[next_id] = Frontier(next_id, x, y, gain, opening=opening)
                 next_id += 1
         self._watch(robot, now_ns, elapsed_s)
         return next_id
 
-    def _miss(self, frontier: Frontier, window: Window, now_ns: int) -> None:
+    def _second_chances(self, next_id: int) -> int:
+        """With nothing else left, frontiers with much to gain that were given up come back, once."""
+        if self.frontiers:
+            return next_id
+        for g in [g for g in self.given_up if g.gain >= self.config.second_chance_gain and not g.again]:
+            self.given_up.remove(g)
+            self.frontiers[next_id] = Frontier(next_id, g.x_m, g.y_m, g.gain, again=True)
+            next_id += 1
+        return next_id
+
+    def _miss(self, frontier: Frontier, window: Window, robot: tuple[float, float], now_ns: int) -> None:
         """A frontier in the window that was not found again: covered, forgotten by the risk map, or cut off."""
         row, column = window.spec.cell_of(frontier.x_m, frontier.y_m)
         if window.state[row, column] == UNKNOWN:
@@ -104,6 +129,13 @@ class FrontierManager:
             slice(max(0, row - reach), row + reach + 1),
             slice(max(0, column - reach), column + reach + 1),
         )
+        if frontier.opening and window.hopeful[near].any():
+            away_m = math.hypot(frontier.x_m - robot[0], frontier.y_m - robot[1])
+            if away_m > self.config.opening_range_m - 1.0:
+                return  # openings are looked for near the robot only
+        if frontier.opening and frontier.rounds < self.config.opening_rounds:
+            del self.frontiers[frontier.node_id]
+            return
         looked = window.probability[near] >= self.config.covered_probability
         open_ground = (
             (window.state[near] != LETHAL) & ~looked & (window.ground[near] | (window.state[near] == FREE))
@@ -119,9 +151,9 @@ class FrontierManager:
                 self.give_up(frontier, "cut off: no way for the robot was found", now_ns)
 
     @staticmethod
-    def _pairs(found: list[tuple[float, float, float]], old: list[Frontier]) -> list[tuple[float, int, int]]:
+    def _pairs(found: list[Found], old: list[Frontier]) -> list[tuple[float, int, int]]:
         pairs = [
-            (math.hypot(x - f.x_m, y - f.y_m), i, f.node_id) for i, (x, y, _) in enumerate(found) for f in old
+            (math.hypot(x.x_m - f.x_m, x.y_m - f.y_m), i, f.node_id) for i, x in enumerate(found) for f in old
         ]
         return sorted(pairs)
 
@@ -137,12 +169,8 @@ class FrontierManager:
                 f.best_gain, f.beside_s, f.pursued_s = f.gain, 0.0, 0.0
             if math.hypot(f.x_m - robot[0], f.y_m - robot[1]) <= self.config.give_up_radius_m:
                 f.beside_s += elapsed_s
-            if f.beside_s > self.config.give_up_s * self._patience(f):
+            if f.beside_s > self.config.give_up_s:
                 self.give_up(f, "stood beside it and saw nothing new", now_ns)
-
-    def _patience(self, frontier: Frontier) -> float:
-        """Much to gain is not given up lightly: the mission would end with it uncovered."""
-        return 1.0 if frontier.gain < self.config.patience_gain else self.config.patience
 
     def progressed(self) -> None:
         """Ground was covered somewhere: the robot has better to do than to go to its target, which loses no time."""
@@ -158,20 +186,22 @@ class FrontierManager:
             f.nearest_m, f.pursued_s = distance_m, 0.0
             return
         f.pursued_s += elapsed_s
-        if f.pursued_s > self.config.pursue_s * self._patience(f):
+        if f.pursued_s > self.config.pursue_s:
             self.give_up(f, "pursued in vain: the robot got no nearer", now_ns)
 
     def give_up(self, frontier: Frontier, reason: str, now_ns: int) -> None:
         """Take a frontier off the list for a while."""
         until = now_ns + int(self.config.retry_after_s * 1e9)
-        self.given_up.append(GivenUp(frontier.x_m, frontier.y_m, frontier.gain, reason, until))
+        self.given_up.append(
+            GivenUp(frontier.x_m, frontier.y_m, frontier.gain, reason, until, frontier.again)
+        )
         self.frontiers.pop(frontier.node_id, None)
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
         return {
             "frontiers": [list(astuple(f)) for _, f in sorted(self.frontiers.items())],
-            "given_up": [[g.x_m, g.y_m, g.gain, g.reason, g.until_ns] for g in self.given_up],
+            "given_up": [list(astuple(g)) for g in self.given_up],
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
@@ -191,19 +221,20 @@ def least_gain(config: Config, ground_m2: float) -> float:
     return max(config.frontier_min_gain, min(share, config.frontier_enough_gain))
 
 
-def find_frontiers(
-    window: Window, config: Config, least: float | None = None
-) -> list[tuple[float, float, float]]:
-    """The frontiers of a window with at least this gain: (x, y, expected information gain), in a fixed order.
+def find_frontiers(window: Window, config: Config, least: float | None = None) -> list[Found]:
+    """The frontiers of a window with at least this expected information gain, in a fixed order.
 
     The uncovered ground is split into connected pieces; the border of a piece with covered ground is cut into blocks
-    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Ground that
-    is covered but borders on the unknown (the way around a corner) is open too: it counts what may lie behind.
+    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Where the
+    robot's centre can get to the border of ground never seen that it may well enter (the way around a corner; not a
+    gap in a ragged wall that its body does not fit), that is open too, and counts what ground may lie behind. Such
+    openings are looked for near the robot only: far walls that it sees at a slant are full of holes.
     """
     s = window.spec
     labels = np.zeros(s.shape, np.int32)
-    unknown = solid(window.unseen)
-    open_ground = window.uncovered | (window.ground & (window.state == FREE) & beside(unknown))
+    openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
+    openings &= near_robot(window, config.opening_range_m)
+    open_ground = window.uncovered | openings
     pieces = label_components(open_ground, labels)
     if pieces == 0:
         return []
@@ -215,27 +246,31 @@ def find_frontiers(
         return []
     reach = round(config.frontier_reach_m / s.resolution_m)
     spread_blocks(open_ground, block, reach, blocks)
+    behind = np.zeros(s.shape, np.int32)
+    sizes = component_centroids(behind, label_components(window.hopeful, behind))[0]
     gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
-    block_gains(window.entropy, unknown, block, gain, sums, hidden)
-    unknown_gain = config.unknown_depth_m * s.resolution_m * LOG_2 / config.spacing_m**2
-    gain += np.minimum(hidden * unknown_gain, config.unknown_max_gain)
+    block_gains(window.entropy, behind, sizes, block, gain, sums, hidden)
+    hidden *= s.resolution_m**2
+    gain += np.minimum(hidden * LOG_2 / config.spacing_m**2, config.unknown_max_gain)
     places = block_places(window.reachable, block, sums, round(1.0 / s.resolution_m))
     piece_of = np.zeros(blocks, np.int64)
     inside = block >= 0
     piece_of[block[inside]] = labels[inside]
     least = config.frontier_min_gain if least is None else least
-    opening = hidden >= config.opening_min_m / s.resolution_m - 1e-9
+    opening = hidden >= config.opening_min_m2 - 1e-9
     # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
     gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
-    return _select(gain, places, piece_of, window, least)
+    return _select(gain, opening, places, piece_of, window, least)
 
 
-def solid(unseen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Unseen cells in the midst of unseen cells (6 of 9): gaps between far rays are not unexplored ground."""
-    padded = np.pad(unseen, 1, mode="edge").astype(np.uint8)
-    rows = padded[:-2] + padded[1:-1] + padded[2:]
-    kept: NDArray[np.bool_] = unseen & (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] >= 6)
-    return kept
+def near_robot(window: Window, range_m: float) -> NDArray[np.bool_]:
+    """Cells within a distance of the robot's cell."""
+    rows = np.arange(window.spec.height) - window.robot_cell[0]
+    columns = np.arange(window.spec.width) - window.robot_cell[1]
+    near: NDArray[np.bool_] = (
+        rows[:, None] ** 2 + columns[None, :] ** 2 <= (range_m / window.spec.resolution_m) ** 2
+    )
+    return near
 
 
 def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -247,11 +282,12 @@ def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _select(
     gain: NDArray[np.float64],
+    opening: NDArray[np.bool_],
     places: NDArray[np.int64],
     piece_of: NDArray[np.int64],
     window: Window,
     least: float,
-) -> list[tuple[float, float, float]]:
+) -> list[Found]:
     """Blocks with enough gain; of a piece of many small blocks that is worth it as a whole, its best block."""
     found = []
     total = np.bincount(piece_of, weights=gain, minlength=int(piece_of.max()) + 1)
@@ -266,7 +302,7 @@ def _select(
         together = best[piece] == index and total[piece] >= least
         if places[index, 0] >= 0 and (alone or together):
             x, y = window.spec.centre_of(int(places[index, 0]), int(places[index, 1]))
-            found.append((x, y, float(gain[index] if alone else total[piece])))
+            found.append(Found(x, y, float(gain[index] if alone else total[piece]), bool(opening[index])))
     return found
 
 
@@ -354,15 +390,17 @@ def spread_blocks(uncovered: NDArray[np.bool_], block: NDArray[np.int32], reach:
 @njit
 def block_gains(
     entropy: NDArray[np.float32],
-    unknown: NDArray[np.bool_],
+    behind: NDArray[np.int32],
+    sizes: NDArray[np.int64],
     block: NDArray[np.int32],
     gain: NDArray[np.float64],
     sums: NDArray[np.float64],
     hidden: NDArray[np.float64],
 ) -> None:
-    """Entropy of each block's cells, and how many of them border on the unknown (hidden).
+    """Entropy of each block's cells, and the size of the largest piece of hopeful ground that they border on (hidden).
 
-    sums: (blocks, 3): number of cells, sum of rows, sum of columns.
+    behind: (h, w) labels of the pieces of hopeful ground, 0 elsewhere. sizes: cells of piece k + 1. sums: (blocks, 3):
+    number of cells, sum of rows, sum of columns.
     """
     height, width = block.shape
     for row in range(height):
@@ -374,14 +412,10 @@ def block_gains(
             sums[b, 0] += 1.0
             sums[b, 1] += row
             sums[b, 2] += column
-            near_unknown = (
-                (row > 0 and unknown[row - 1, column])
-                or (row < height - 1 and unknown[row + 1, column])
-                or (column > 0 and unknown[row, column - 1])
-                or (column < width - 1 and unknown[row, column + 1])
-            )
-            if near_unknown:
-                hidden[b] += 1.0
+            for d_row, d_column in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+                r, c = row + d_row, column + d_column
+                if r >= 0 and c >= 0 and r < height and c < width and behind[r, c] > 0:
+                    hidden[b] = max(hidden[b], float(sizes[behind[r, c] - 1]))
 
 
 @njit

@@ -264,13 +264,37 @@ class Roadmap:
         return {
             "nodes": [[n, dict(d)] for n, d in sorted(self.graph.nodes(data=True))],
             "edges": sorted([min(a, b), max(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
+            **self._beside_graph(),
+            "unpublished": self._unpublished(),
+        }
+
+    def _unpublished(self) -> list[list[Any]]:
+        """What the last message said otherwise than the graph is now: [key, values], without values for what is new."""
+        now = self._contents() if self._published else {}
+        before = self._published
+        differs = [[k, list(v)] for k, v in before.items() if now.get(k) != v]
+        return differs + [[k, None] for k in now if k not in before]
+
+    def _beside_graph(self) -> dict[str, Any]:
+        return {
             "manager": self.manager.state(),
             "counters": [self.next_id, self.version, self.last_breadcrumb],
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """From a snapshot; the next message is whole."""
+        """From a snapshot."""
         self.graph = nx.Graph()
+        self._set_parts(state)
+        self._published = self._contents() if self.version > 0 else {}
+        for key, values in state["unpublished"]:
+            name = tuple(key) if isinstance(key, list) else key
+            if values is None:
+                del self._published[name]
+            else:
+                self._published[name] = tuple(values)
+
+    def _set_parts(self, state: dict[str, Any]) -> None:
+        """Nodes and edges are added or replaced, the rest is as in the state."""
         for node, data in state["nodes"]:
             if "joined_at" in data:
                 data["joined_at"] = tuple(data["joined_at"])
@@ -279,6 +303,26 @@ class Roadmap:
         self.manager.set_state(state["manager"])
         self.next_id, self.version, self.last_breadcrumb = state["counters"]
         self._published = {}
+
+    def difference(self, message: GlobalIrm) -> dict[str, Any]:
+        """What a message that was just made tells, with all that the graph keeps of it: for the journal."""
+        edges = zip(message.edge_a.tolist(), message.edge_b.tolist(), strict=True)
+        return {
+            "whole": message.base_version == 0,
+            "nodes": [[n, dict(self.graph.nodes[n])] for n in message.node_id.tolist()],
+            "edges": [[a, b, dict(self.graph.edges[a, b])] for a, b in edges],
+            "removed_nodes": message.removed_node.tolist(),
+            "removed_edges": message.removed_edge.tolist(),
+            **self._beside_graph(),
+        }
+
+    def apply_difference(self, difference: dict[str, Any]) -> None:
+        """Take in a difference from the journal; the next message is whole."""
+        if difference["whole"]:
+            self.graph = nx.Graph()
+        self.graph.remove_nodes_from(difference["removed_nodes"])
+        self.graph.remove_edges_from((a, b) for a, b in difference["removed_edges"])
+        self._set_parts(difference)
 
 
 class _Search:

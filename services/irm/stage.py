@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import zlib
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +32,7 @@ from schemas.topics import (
     RISK_MAP,
     STATUS_GRAPH_REQUEST,
 )
-from schemas.world import CoverageSummary, CoverageWindow, GridHeader, RiskMap
+from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GridHeader, RiskMap
 from services.irm.config import Config
 from services.irm.footprints import FootprintStore
 from services.irm.local_irm import LocalIrmBuilder
@@ -40,8 +42,12 @@ from services.irm.window import Window, build_window, window_picture
 
 __all__ = ["Config", "IrmStage", "create", "spec"]
 
+_BLOCKED_AGAIN_NS = 5 * SECOND_NS
+"""Blocked at one place again after so long, it counts once more."""
 _MAX_PENDING = 50
 _PROGRESS_M2 = 0.3
+_SKIPPED_VERSIONS = 1000
+"""More than the versions of the Local IRM that are given between two records."""
 
 
 def spec(config: Config) -> StageSpec:
@@ -74,6 +80,8 @@ class IrmStage:
         self._penalties: list[tuple[int, float, float]] = []
         self._global_ns = -(10**18)
         self._covered_m2 = 0.0
+        self._window_spec: GridSpec | None = None
+        self._resumed = False
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One round of Algorithm 1; nothing while the risk map or the pose is missing or stale."""
@@ -81,12 +89,18 @@ class IrmStage:
         self._pending = self._pending[-_MAX_PENDING:]
         self._read_pose_graph(inputs)
         risk, odometry = inputs.current(RISK_MAP), inputs.current(ODOMETRY)
+        if self._resumed and odometry is not None:
+            # Before anything is changed: readers hear that what was acknowledged still stands.
+            self._resumed = False
+            whole = self._roadmap.message(odometry.pose, odometry.map_to_odom, now, True)
+            return [Output(GLOBAL_IRM, whole)]
         if risk is None or odometry is None:
             return []
         self._allocate(risk)
         self._read_follower(now, inputs, odometry)
         self._add_scans(risk, odometry)
         window = self._window(risk, odometry, now)
+        self._window_spec = window.spec
         assert self._local is not None
         local = self._local.build(window, odometry.pose, odometry.map_to_odom, risk.stamp_ns)
         found: Outputs = [Output(LOCAL_IRM, local)]
@@ -101,10 +115,13 @@ class IrmStage:
 
     def _allocate(self, risk: RiskMap) -> None:
         if self._ground is None:
-            self._ground = TileLayer("uint8", 0, risk.grid.resolution_m)
-            self._coverage = TileLayer("float32", 0.0, risk.grid.resolution_m)
-            self._store = FootprintStore(self._coverage)
-            self._local = LocalIrmBuilder(self._config, risk.footprint_radius_m)
+            self._make_layers(risk.grid.resolution_m, risk.footprint_radius_m, 0)
+
+    def _make_layers(self, resolution_m: float, radius_m: float, version: int) -> None:
+        self._ground = TileLayer("uint8", 0, resolution_m)
+        self._coverage = TileLayer("float32", 0.0, resolution_m)
+        self._store = FootprintStore(self._coverage)
+        self._local = LocalIrmBuilder(self._config, radius_m, version)
 
     def _read_pose_graph(self, inputs: Inputs) -> None:
         received = inputs.latest(POSE_GRAPH)
@@ -126,7 +143,8 @@ class IrmStage:
         if follower is None or not (follower.blocked or follower.stuck):
             return
         ahead = planar(odometry.map_to_odom).compose(planar(odometry.pose)).apply(0.5, 0.0)
-        if all(math.dist(ahead, p[1:]) > 0.3 for p in self._penalties):
+        lately = [p for p in self._penalties if now - p[0] < _BLOCKED_AGAIN_NS]
+        if all(math.dist(ahead, p[1:]) > 0.3 for p in lately):  # again and again: worse and worse
             self._penalties.append((now, *ahead))
 
     def _add_scans(self, risk: RiskMap, odometry: Odometry) -> None:
@@ -245,14 +263,55 @@ class IrmStage:
         self._global_ns = state["global_ns"]
         self._covered_m2 = state["covered_m2"]
         if state["resolution"]:
-            self._ground = TileLayer("uint8", 0, state["resolution"])
+            self._make_layers(state["resolution"], state["radius"], state["version"])
+            assert self._ground and self._coverage and self._store and self._local
             self._ground.set_state(state["ground"])
-            self._coverage = TileLayer("float32", 0.0, state["resolution"])
             self._coverage.set_state(state["coverage"])
-            self._store = FootprintStore(self._coverage)
             self._store.set_state(state["footprints"])
-            self._local = LocalIrmBuilder(self._config, state["radius"], state["version"])
             self._local.set_state(state["anchors"])
+
+    def journal(self, outputs: Outputs) -> bytes:
+        """What the Global IRM and the coverage in `outputs` tell: the graph's difference, footprints and ground."""
+        assert self._ground and self._store and self._local
+        record: dict[str, Any] = {
+            "graph": [
+                self._roadmap.difference(output.message)
+                for output in outputs
+                if isinstance(output.message, GlobalIrm)
+            ],
+            "footprints": self._store.take_changes(),
+            "resolution": self._ground.resolution_m,
+            "radius": self._local.footprint_radius_m,
+            "version": self._local.version,
+            "global_ns": self._global_ns,
+            "covered_m2": self._covered_m2,
+            "penalties": self._penalties,
+        }
+        if self._window_spec is not None:
+            record["spec"] = list(self._window_spec)
+            record["ground"] = self._ground.read(self._window_spec)
+        return zlib.compress(pack_snapshot(record), 1)
+
+    def replay(self, record: bytes) -> None:
+        """Take in a record of the journal."""
+        state = unpack_snapshot(zlib.decompress(record))
+        if self._ground is None:
+            self._make_layers(state["resolution"], state["radius"], state["version"])
+        assert self._ground and self._store and self._local
+        for difference in state["graph"]:
+            self._roadmap.apply_difference(difference)
+        self._store.apply_changes(state["footprints"])
+        if "spec" in state:
+            self._ground.write(GridSpec(*state["spec"]), state["ground"])
+        self._local.version = state["version"]
+        self._global_ns, self._covered_m2 = state["global_ns"], state["covered_m2"]
+        self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
+
+    def resumed(self) -> None:
+        """Versions of the Local IRM that were given since the last record are not given again."""
+        self._resumed = self._roadmap.version > 0
+        if self._local is not None:
+            self._local.version += _SKIPPED_VERSIONS
 
 
 def _exploring(inputs: Inputs) -> bool:

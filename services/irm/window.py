@@ -25,15 +25,16 @@ KNOWN, GROUND = 2, 1
 class Window:
     """What is known around the robot, all (h, w) over `spec` in `map`.
 
-    unseen: never known, not only forgotten by the risk map. passable: the robot's centre fits. free_space: passable
-    and connected to the robot. ground: what its body can touch from there. uncovered: ground below the covered
+    hopeful: never seen (not only forgotten by the risk map), but the robot's centre may fit there and get there, as
+    far as obstacles are known. free_space: its centre fits, and gets there over known ground; reachable: or over
+    forgotten ground. ground: what its body can touch from there. uncovered: ground below the covered
     probability, slivers of one cell left out. entropy: of uncovered cells, nats of whole patches (0 elsewhere).
     hazard: CVaR of the hazard rate, its mean under the body, 1/m. step_cost: cost per metre of the grid search.
     """
 
     spec: GridSpec
     state: NDArray[np.uint8]
-    unseen: NDArray[np.bool_]
+    hopeful: NDArray[np.bool_]
     clearance_m: NDArray[np.float32]
     hazard: NDArray[np.float32]
     step_cost: NDArray[np.float32]
@@ -84,6 +85,9 @@ def build_window(
     layer[risk.state != UNKNOWN] = KNOWN
     layer[ground] = GROUND
     ground_layer.write(spec, layer)
+    unseen = layer == 0
+    hopeful = solid(unseen) & (risk.clearance_m >= needed)
+    hopeful &= connected_free_space(reachable | hopeful, robot)
     p = probability(coverage_layer.read(spec))
     uncovered = without_slivers(ground & (p < config.covered_probability))
     cell_share = (g.resolution_m / config.spacing_m) ** 2
@@ -91,7 +95,7 @@ def build_window(
     return Window(
         spec=spec,
         state=risk.state,
-        unseen=layer == 0,
+        hopeful=hopeful,
         clearance_m=risk.clearance_m,
         hazard=hazard,
         step_cost=_step_cost(hazard, risk.clearance_m, needed, config.comfort_clearance_m),
@@ -140,6 +144,14 @@ def connected_free_space(passable: NDArray[np.bool_], robot: tuple[int, int]) ->
             if int(reached.sum()) > 4:
                 break
     return reached
+
+
+def solid(unseen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Unseen cells in the midst of unseen cells (6 of 9): gaps between far rays are not unexplored ground."""
+    padded = np.pad(unseen, 1, mode="edge").astype(np.uint8)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    kept: NDArray[np.bool_] = unseen & (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] >= 6)
+    return kept
 
 
 def without_slivers(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -37,6 +37,13 @@ class Config(BaseModel):
     cover_radius_m: float = Field(
         14.0, ge=1, le=60, description="Ground up to here counts as in reach, m of travel."
     )
+    promise_moves: int = Field(
+        6, ge=1, le=100, description="Patches that so many moves are to cover count as promised."
+    )
+    promises: float = Field(
+        14.0, ge=1, le=1e6, description="Answers that may promise a patch in vain; then it is left alone"
+    )
+    promise_rest_s: float = Field(180.0, ge=0, le=1e5, description="for so long, s.")
     seconds_per_deadline: float = Field(
         0.3, ge=0.01, le=10, description="Live planning time of an episode, s."
     )

@@ -13,12 +13,16 @@ from planning.coverage_model import (
     SWEEP,
     SWEEP_STEPS,
     CoverageModel,
+    evaluate_moves,
     follow_rule,
     look,
 )
 from planning.lattice_graph import neighbour, travel_costs
 from planning.pomcp import PolicyTree
 from schemas.world import LocalIrm
+
+_FEW_PATCHES = 3
+"""Steps that newly cover no more patches than this are made for them alone."""
 
 
 def likely_moves(
@@ -46,6 +50,40 @@ def likely_moves(
         count = follow_rule(model, node, heading, covered, rest)
         moves += [int(k) for k in rest[:count]]
     return moves[:steps], in_tree
+
+
+def covered_by(model: CoverageModel, node: int, heading: int, moves: list[int]) -> NDArray[np.bool_]:
+    """The nodes that these moves newly cover when nothing is blocked, (n,)."""
+    covered, scratch = (
+        model.covered.copy(),
+        (np.zeros(len(moves)), np.zeros(len(moves)), np.zeros(len(moves))),
+    )
+    evaluate_moves(model, node, heading, np.array(moves, np.int64), covered, *scratch)
+    new = covered & ~model.covered
+    columns = np.arange(model.size, dtype=np.uint64)
+    return ((new[:, None] >> columns[None, :]) & np.uint64(1)).astype(np.bool_).ravel()
+
+
+def step_terms(
+    model: CoverageModel, node: int, heading: int, moves: list[int]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Of the step into each node of a path (the first: 0): its expected reward, and whether a look hangs on it.
+
+    A look hangs on a step that covers only a few patches: leftovers, seen from that node under that heading, which a
+    smoother line would pass by. Amid fresh ground any line will do. Both (len(moves) + 1,).
+    """
+    steps = np.array(moves, np.int64)
+    reward, scratch = np.zeros(len(steps)), (np.zeros(len(steps)), np.zeros(len(steps)))
+    evaluate_moves(model, node, heading, steps, model.covered.copy(), reward, *scratch)
+    covered, looks = model.covered.copy(), np.zeros(len(steps) + 1, np.uint8)
+    before = int(np.bitwise_count(covered).sum())
+    for i, k in enumerate(moves):
+        look(model, node, k, covered)
+        node = neighbour(node, k, model.size)
+        look(model, node, k, covered)
+        after = int(np.bitwise_count(covered).sum())
+        looks[i + 1], before = 0 < after - before <= _FEW_PATCHES, after
+    return np.concatenate([np.zeros(1), reward]), looks
 
 
 def _unfold(

@@ -16,11 +16,11 @@ from planning.reward import leftover_entropy, parameters
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
-from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.snapshot import pack_message, pack_snapshot, unpack_message, unpack_snapshot
 from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
 from schemas.world import LocalIrm
 from services.lcp.config import Config
-from services.lcp.policy_path import likely_moves, line_of, moves_to
+from services.lcp.policy_path import covered_by, likely_moves, line_of, moves_to, step_terms
 from services.lcp.problem import (
     Junction,
     coverage_model,
@@ -30,6 +30,7 @@ from services.lcp.problem import (
     node_at,
     planar,
 )
+from services.lcp.promises import Index, Promises
 
 __all__ = ["Config", "LcpStage", "create", "spec", "warm_up"]
 
@@ -61,6 +62,7 @@ class LcpStage:
         self._irms: OrderedDict[int, LocalIrm] = OrderedDict()
         self._covering = True
         self._answered = 0
+        self._promises = Promises(config.promises, config.promise_rest_s)
         self._solver = Pomcp(
             state_size=BITS + 61,
             max_actions=ACTIONS,
@@ -95,10 +97,19 @@ class LcpStage:
             junction = junction_of(request, irm)
         except ValueError as error:
             return _nothing(now, request, str(error))
-        entropy = local_entropy(irm)
+        entropy = self._wanted_entropy(now, irm)
         if not returning and self._should_cover(irm, junction, entropy, policy):
             return self._cover(now, request, irm, junction, entropy, policy)
         return self._guide(now, request, irm, junction, policy)
+
+    def _wanted_entropy(self, now: Stamp, irm: LocalIrm) -> np.ndarray:
+        """Entropy of what can be covered in this window, without the patches that are left alone. (n,)"""
+        entropy = local_entropy(irm)
+        here = indexed(irm, entropy)
+        for ix, iy in self._promises.left_alone(now, here):
+            if (ix, iy) in here:
+                entropy[_node(irm, (ix, iy))] = 0.0
+        return entropy
 
     def _should_cover(
         self, irm: LocalIrm, junction: Junction, entropy: np.ndarray, policy: GlobalPolicy | None
@@ -158,8 +169,12 @@ class LcpStage:
             self._config.value_rollouts,
         )
         reason = f"covers: value {root.best_value:.2f} by {report.simulations} simulations"
+        soon = covered_by(model, junction.node, junction.heading, moves[: self._config.promise_moves])
+        here = indexed(irm, local_entropy(irm))
+        self._promises.note(now, (index for index in here if soon[_node(irm, index)]), here)
+        terms = step_terms(model, junction.node, junction.heading, moves)
         return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, moves, in_tree, tree,
-                       float(root.best_value), report.simulations, report.nodes, float(rollout))  # fmt: skip
+                       float(root.best_value), report.simulations, report.nodes, float(rollout), terms)  # fmt: skip
 
     def _deadline(self) -> Callable[[], bool] | None:
         """Whether the planning time of this episode is over; None where time is not measured (lock-step)."""
@@ -194,13 +209,36 @@ class LcpStage:
         return _nothing(now, request, f"no way to target {policy.target} in the Local IRM")
 
     def snapshot(self) -> bytes:
-        """The phase and the last episode; Local IRMs come again."""
-        return pack_snapshot({"covering": self._covering, "answered": self._answered})
+        """The phase, the last episode, the Local IRMs that the next one may name, and what was promised; a search
+        begins anew."""
+        return pack_snapshot(
+            {
+                "covering": self._covering,
+                "answered": self._answered,
+                "irms": [pack_message(irm) for irm in self._irms.values()],
+                "promises": self._promises.state(),
+            }
+        )
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot."""
         state = unpack_snapshot(snapshot)
         self._covering, self._answered = bool(state["covering"]), int(state["answered"])
+        irms = [unpack_message(packed, LocalIrm) for packed in state["irms"]]
+        self._irms = OrderedDict((irm.irm_version, irm) for irm in irms)
+        self._promises.set_state(state["promises"])
+
+
+def indexed(irm: LocalIrm, entropy: np.ndarray) -> dict[Index, float]:
+    """The uncovered patches of a window by their global lattice index."""
+    return {
+        (irm.ix0 + int(n) % irm.size, irm.iy0 + int(n) // irm.size): float(entropy[n])
+        for n in np.flatnonzero(entropy > 0.0)
+    }
+
+
+def _node(irm: LocalIrm, index: Index) -> int:
+    return (index[1] - irm.iy0) * irm.size + index[0] - irm.ix0
 
 
 def _near_reach(irm: LocalIrm, cost: np.ndarray, radius_m: float) -> np.ndarray:
@@ -239,8 +277,10 @@ def _policy(
     simulations: int,
     tree_nodes: int,
     rollout: float = 0.0,
+    terms: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> LocalPolicy:
     nodes, points, at = line_of(irm, junction.node, moves)
+    reward, looks = terms or (np.zeros(len(nodes)), np.zeros(len(nodes), np.uint8))
     lattice = [(irm.ix0 + n % irm.size, irm.iy0 + n // irm.size) for n in nodes]
     return LocalPolicy(
         stamp_ns=now,
@@ -255,8 +295,9 @@ def _policy(
         tree_nodes=tree_nodes,
         planning_ms=0.0,
         path_lattice=np.array(lattice, np.int32).reshape(-1, 2),
-        path_reward=np.zeros(len(nodes)),
+        path_reward=reward,
         path_in_tree=np.array([1 if i <= in_tree else 0 for i in range(len(nodes))], np.uint8),
+        path_look=looks,
         path_xy_m=np.array(points, np.float64).reshape(-1, 2),
         path_node_point=np.array(at, np.int32),
         tree_action=tree.node_action,
@@ -285,6 +326,7 @@ def _nothing(now: Stamp, request: EpisodeRequest, reason: str) -> LocalPolicy:
         path_lattice=np.zeros((0, 2), np.int32),
         path_reward=none,
         path_in_tree=np.zeros(0, np.uint8),
+        path_look=np.zeros(0, np.uint8),
         path_xy_m=np.zeros((0, 2)),
         path_node_point=np.zeros(0, np.int32),
         tree_action=np.zeros(0, np.int32),

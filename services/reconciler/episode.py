@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,14 @@ from planning.randomness import stream
 from planning.reward import leftover_entropy, parameters
 from planning.search import dijkstra_box, trace_path
 from schemas.sensing import Odometry
+from schemas.snapshot import pack_message, unpack_message
 from schemas.world import LocalIrm
 from services.reconciler.config import Config
 from services.reconciler.path import Ground, headings
+
+
+_MOST_SPREAD = 0.05
+"""Of a pose in `odom`, m and rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +60,17 @@ class Opened:
     tau_s: float
     keeps_old: bool
     junction_point: int = 0
+
+
+def pack_opened(opened: Opened) -> dict[str, Any]:
+    """For a snapshot."""
+    state: dict[str, Any] = {f.name: getattr(opened, f.name) for f in fields(opened)}
+    return {**state, "irm": pack_message(opened.irm)}
+
+
+def unpack_opened(state: dict[str, Any]) -> Opened:
+    """From a snapshot."""
+    return Opened(**{**state, "irm": unpack_message(state["irm"], LocalIrm)})
 
 
 def heading_index(yaw_rad: float) -> int:
@@ -139,7 +156,9 @@ def junction_particles(
     Returns (nodes, headings, weights), one entry a distinct state, the junction itself always among them.
     """
     rng = stream(seed, "reconciler", "junction", episode)
-    spread = np.sqrt(np.maximum(np.diag(odometry.covariance), 0.0)) + np.array([0.05, 0.05, 0.05])
+    # The junction lies in `odom`, where nothing drifts within a horizon; the covariance is that of the place in `map`.
+    deviation = np.sqrt(np.maximum(np.diag(odometry.covariance), 0.0))
+    spread = np.minimum(deviation, _MOST_SPREAD) + np.array([0.05, 0.05, 0.05])
     offset = rng.normal(size=(count, 3)) * spread
     x = irm.anchor_m[node, 0] + offset[:, 0]
     y = irm.anchor_m[node, 1] + offset[:, 1]

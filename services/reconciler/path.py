@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -41,21 +42,37 @@ def project(points: NDArray[np.float64], x_m: float, y_m: float, low: int, high:
     return low + best, float(distance[best])
 
 
-def smooth(points: NDArray[np.float64], fixed: int, ground: Ground, config: Config) -> NDArray[np.float64]:
+def smooth(
+    points: NDArray[np.float64],
+    fixed: int,
+    ground: Ground,
+    config: Config,
+    pinned: NDArray[np.int64] | None = None,
+) -> NDArray[np.float64]:
     """The line resampled to STEP_M, corners rounded and pushed off walls; the first `fixed` points stay as they are.
 
-    points: (k, 2) m. No step makes the clearance worse below the comfort clearance.
+    points: (k, 2) m. pinned: (m,) indices of points through which the line must go, with its corner there as sharp as
+    it is. No step makes the clearance worse below the comfort clearance.
     """
-    kept, rest = points[:fixed], points[max(fixed - 1, 0) :]
+    first = max(fixed - 1, 0)
+    kept, rest = points[:fixed], points[first:]
     s = ground.spec
-    rest = string_pull(
-        rest, ground.clearance_m, s.resolution_m, s.ix0, s.iy0, config.comfort_clearance_m, 0.4, 6
-    )
-    line = resample(rest)
-    relax(
-        line, ground.clearance_m, s.resolution_m, s.ix0, s.iy0, config.comfort_clearance_m, 40,
-        config.footprint_radius_m,
-    )  # fmt: skip
+    stops = [] if pinned is None else [int(p) - first for p in pinned if 0 < p - first < len(rest) - 1]
+    bounds = [0, *dict.fromkeys(stops), len(rest) - 1]
+    pieces: list[NDArray[np.float64]] = []
+    for low, high in itertools.pairwise(bounds):
+        piece = resample(
+            string_pull(
+                rest[low : high + 1], ground.clearance_m, s.resolution_m, s.ix0, s.iy0,
+                config.comfort_clearance_m, 0.4, 6,
+            )
+        )  # fmt: skip
+        relax(
+            piece, ground.clearance_m, s.resolution_m, s.ix0, s.iy0, config.comfort_clearance_m, 40,
+            config.footprint_radius_m,
+        )  # fmt: skip
+        pieces.append(piece if not pieces else piece[1:])
+    line = np.concatenate(pieces) if pieces else rest[:1]
     return np.concatenate([kept[:-1], line]) if fixed > 1 else line
 
 

@@ -22,7 +22,6 @@ from services.irm.frontiers import (
     block_places,
     find_frontiers,
     mark_borders,
-    solid,
     spread_blocks,
 )
 from services.irm.window import Window
@@ -35,9 +34,9 @@ CONFIG = Config(
     frontier_block_m=2.0,
     frontier_reach_m=3.0,
     frontier_min_gain=0.3,
-    unknown_depth_m=1.0,
     unknown_max_gain=1.5,
-    opening_min_m=1.5,
+    opening_min_m2=0.6,
+    opening_range_m=7.0,
     frontier_enough_gain=0.7,
     spacing_m=1.0,
 )
@@ -54,7 +53,7 @@ def random_window(seed: int) -> Window:
     state[dark > np.quantile(dark, rng.uniform(0.6, 1.0))] = UNKNOWN  # in solid pieces, over ground too
     old = ndimage.gaussian_filter(rng.normal(size=spec.shape), 1.5)
     forgotten = ground | (old > np.quantile(old, rng.uniform(0.5, 1.0)))
-    unseen = (state == UNKNOWN) & ~forgotten
+    hopeful = (state == UNKNOWN) & ~forgotten & (rng.random(spec.shape) < rng.uniform(0.3, 1.0))
     other = ndimage.gaussian_filter(rng.normal(size=spec.shape), 1.5)
     uncovered = ground & (other > np.quantile(other, rng.uniform(0.0, 0.9)))
     entropy = np.where(ground, rng.uniform(0.0, LOG_2, spec.shape) * RES**2, 0.0).astype(np.float32)
@@ -63,7 +62,7 @@ def random_window(seed: int) -> Window:
     return Window(
         spec=spec,
         state=state,
-        unseen=unseen,
+        hopeful=hopeful,
         clearance_m=zeros,
         hazard=zeros,
         step_cost=zeros + 1,
@@ -78,8 +77,11 @@ def random_window(seed: int) -> Window:
 
 
 def open_of(window: Window) -> NDArray[np.bool_]:
-    """Uncovered ground, and covered ground at the edge of what was never seen, by brute force."""
-    edge = window.ground & (window.state == FREE) & _brute_hidden(window)
+    """Uncovered ground, and reachable ground at the edge of what may be entered unseen, by brute force."""
+    rows, columns = np.indices(window.spec.shape)
+    away = np.hypot(rows - window.robot_cell[0], columns - window.robot_cell[1]) * window.spec.resolution_m
+    near = away <= CONFIG.opening_range_m
+    edge = near & window.reachable & (window.state == FREE) & _brute_edge(window)
     found: NDArray[np.bool_] = window.uncovered | edge
     return found
 
@@ -155,28 +157,44 @@ def test_each_open_cell_counts_for_its_nearest_block_and_for_no_other(seed: int)
     assert (steps[block[rows, columns], rows, columns] == nearest[rows, columns]).all()
 
 
-def _brute_hidden(window: Window) -> NDArray[np.bool_]:
-    """Cells beside the unseen; unseen cells of which not two thirds of the cells around are unseen do not count."""
-    unseen = window.unseen.astype(np.int64)
-    core = window.unseen & (ndimage.convolve(unseen, EIGHT.astype(np.int64), mode="nearest") >= 6)
-    grown: NDArray[np.bool_] = ndimage.binary_dilation(core, ndimage.generate_binary_structure(2, 1))
+CROSS = ndimage.generate_binary_structure(2, 1)
+
+
+def _brute_edge(window: Window) -> NDArray[np.bool_]:
+    """Cells beside ground never seen that the robot may enter."""
+    grown: NDArray[np.bool_] = ndimage.binary_dilation(window.hopeful, CROSS)
     return grown
+
+
+def _behind(window: Window) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """(labels, sizes) of the pieces of hopeful ground."""
+    labels = np.zeros(window.spec.shape, np.int32)
+    count = label_components(window.hopeful, labels)
+    return labels, np.array([(labels == k + 1).sum() for k in range(count)], np.int64)
+
+
+def _brute_hidden(window: Window, cells: NDArray[np.bool_]) -> float:
+    """Area of the largest piece of hopeful ground that these cells have a side in common with, m2."""
+    pieces, count = ndimage.label(window.hopeful, EIGHT)
+    touched = ndimage.binary_dilation(cells, CROSS)
+    sizes = [int((pieces == k).sum()) for k in range(1, count + 1) if (touched & (pieces == k)).any()]
+    return max(sizes, default=0) * RES**2
 
 
 def _gains(
     window: Window, openings: bool = True
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
-    """(block of each cell, gain of each block, pieces) by brute force. openings: three hidden cells are enough."""
+    """(block of each cell, gain of each block, pieces) by brute force. openings: much hidden is enough."""
     block, blocks, labels = blocks_of(window, CONFIG)
     spread_blocks(open_of(window), block, round(CONFIG.frontier_reach_m / RES), blocks)
-    bonus, hidden = CONFIG.unknown_depth_m * RES * LOG_2, _brute_hidden(window)
+    hidden = [_brute_hidden(window, block == b) for b in range(blocks)]
     gains = [
         float(window.entropy[block == b].sum(dtype=np.float64))
-        + min(bonus * int(hidden[block == b].sum()), CONFIG.unknown_max_gain)
+        + min(LOG_2 * hidden[b], CONFIG.unknown_max_gain)
         for b in range(blocks)
     ]
     for b in range(blocks):
-        if openings and int(hidden[block == b].sum()) >= 3:
+        if openings and hidden[b] >= CONFIG.opening_min_m2:
             gains[b] = max(gains[b], CONFIG.frontier_enough_gain)
     return block, np.array(gains), labels
 
@@ -186,9 +204,9 @@ def test_a_gain_is_the_entropy_of_its_cells_and_of_the_unseen_beside_them(seed: 
     window = random_window(seed)
     block, gains, _ = _gains(window, openings=False)
     gain, hidden, sums = np.zeros(len(gains)), np.zeros(len(gains)), np.zeros((len(gains), 3))
-    block_gains(window.entropy, solid(window.unseen), block, gain, sums, hidden)
-    bonus = CONFIG.unknown_depth_m * RES * LOG_2
-    assert gain + np.minimum(hidden * bonus, CONFIG.unknown_max_gain) == pytest.approx(gains, abs=1e-6)
+    block_gains(window.entropy, *_behind(window), block, gain, sums, hidden)
+    behind = np.minimum(hidden * RES**2 * LOG_2, CONFIG.unknown_max_gain)
+    assert gain + behind == pytest.approx(gains, abs=1e-6)
     for b in range(len(gains)):
         cells = np.argwhere(block == b)
         assert sums[b].tolist() == [len(cells), *cells.sum(axis=0)]
@@ -200,7 +218,7 @@ def test_a_place_can_be_reached_near_its_block_and_is_best_for_it(seed: int) -> 
     window = random_window(seed)
     block, gains, _ = _gains(window)
     sums = np.zeros((len(gains), 3))
-    block_gains(window.entropy, solid(window.unseen), block, np.zeros(len(gains)), sums, np.zeros(len(gains)))
+    block_gains(window.entropy, *_behind(window), block, np.zeros(len(gains)), sums, np.zeros(len(gains)))
     reach = 2
     places = block_places(window.reachable, block, sums, reach)
     free = np.argwhere(window.reachable)
@@ -229,9 +247,9 @@ def test_every_piece_that_is_worth_it_has_a_frontier_and_no_gain_counts_twice(se
     window = random_window(seed)
     found = find_frontiers(window, CONFIG)
     block, gains, labels = _gains(window)
-    for x, y, _ in found:
+    for x, y, _, _ in found:
         assert window.reachable[window.spec.cell_of(x, y)]
-    assert sum(g for _, _, g in found) <= gains.sum() + 1e-6
+    assert sum(g for _, _, g, _ in found) <= gains.sum() + 1e-6
     alone = [g for g in gains if g >= CONFIG.frontier_min_gain]
     for piece in range(1, int(labels.max()) + 1):
         mine = np.unique(block[(labels == piece) & (block >= 0)])
@@ -241,8 +259,8 @@ def test_every_piece_that_is_worth_it_has_a_frontier_and_no_gain_counts_twice(se
             best = mine[int(np.argmax(gains[mine]))]
             if (window.reachable & (block == best)).any():
                 expected = gains[best] if gains[best] in alone else gains[mine].sum()
-                assert any(g == pytest.approx(expected, abs=1e-5) for _, _, g in found)
-    assert all(g >= CONFIG.frontier_min_gain - 1e-9 for _, _, g in found)
+                assert any(g == pytest.approx(expected, abs=1e-5) for _, _, g, _ in found)
+    assert all(g >= CONFIG.frontier_min_gain - 1e-9 for _, _, g, _ in found)
 
 
 @given(seed=st.integers(0, 3000), share=st.floats(0.1, 0.9))
@@ -263,13 +281,10 @@ def test_in_a_real_window_every_piece_of_open_ground_has_a_frontier(seed: int, s
             continue
         worth += 1
         cells = np.argwhere(pieces == piece) * 0.2 + np.array([flat.spec.iy0, flat.spec.ix0]) * 0.2 + 0.1
-        assert any(np.hypot(cells[:, 1] - fx, cells[:, 0] - fy).min() <= 0.3 for fx, fy, _ in found)
+        assert any(np.hypot(cells[:, 1] - fx, cells[:, 0] - fy).min() <= 0.3 for fx, fy, _, _ in found)
     assert len(found) >= worth
-    bonus = config.unknown_depth_m * 0.2 * LOG_2
-    most = float(window.entropy.sum(dtype=np.float64)) + bonus * int(
-        (open_ground & _brute_hidden(window)).sum()
-    )
-    assert sum(g for _, _, g in found) <= most + config.frontier_enough_gain * len(found) + 1e-4
+    most = float(window.entropy.sum(dtype=np.float64)) + config.unknown_max_gain * len(found)
+    assert sum(g for _, _, g, _ in found) <= most + 1e-4
 
 
 def _manager(**changes: float) -> tuple[FrontierManager, Belief, Flat]:
@@ -321,7 +336,7 @@ def test_frontiers_outside_the_window_are_kept_as_they_were() -> None:
 
 
 def test_a_frontier_that_yields_nothing_is_given_up_and_comes_back_after_a_while() -> None:
-    manager, belief, flat = _manager(give_up_s=5.0, retry_after_s=30.0, patience=1.0)
+    manager, belief, flat = _manager(give_up_s=5.0, retry_after_s=30.0, second_chance_gain=99.0)
     _cover_up_to(belief, flat, 6.0)
     window = belief.window(flat.risk_map(), 0.0, 2.5)
     next_id = manager.update(window, (-7.0, 2.5), 0, 1.0, 1)

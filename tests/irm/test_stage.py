@@ -275,7 +275,7 @@ def test_the_frontier_that_the_global_planner_pursues_in_vain_is_given_up(
     offset: int, given_up: bool
 ) -> None:
     """The policy's target and distance count, by the time between rounds; a target that is no frontier is ignored."""
-    config = CONFIG.model_copy(update={"pursue_s": 5.0, "give_up_s": 600.0, "patience": 1.0})
+    config = CONFIG.model_copy(update={"pursue_s": 5.0, "give_up_s": 600.0, "second_chance_gain": 999.0})
     stage, flat = IrmStage(config), room(-4.0, -4.0, 4.0, 4.0, 0.2)
     names: list[int] = []
     reasons: list[list[str]] = []

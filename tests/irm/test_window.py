@@ -134,19 +134,24 @@ def test_ground_beyond_what_the_map_has_forgotten_can_still_be_reached_but_not_b
     assert not shut.reachable[cell] and not shut.ground[cell]
 
 
-def test_unseen_is_what_no_risk_map_ever_knew_wherever_the_robot_is_by_now() -> None:
+def test_hopeful_is_what_no_risk_map_ever_knew_and_where_the_robot_may_fit_and_get() -> None:
     flat = two_rooms(0.4)
+    flat.fill(-1.2, -1.0, -0.2, 1.0, UNKNOWN)
     flat.fill(2.0, -1.0, 3.0, 1.0, UNKNOWN)
-    belief, hole, far = Belief.new(Config(), RES), flat.spec.cell_of(2.5, 0.0), flat.spec.cell_of(4.0, 0.0)
+    belief, hole, far = Belief.new(Config(), RES), flat.spec.cell_of(-0.7, 0.0), flat.spec.cell_of(2.5, 0.0)
+    beside_the_wall = flat.spec.cell_of(-0.25, 0.9)
     first = belief.window(flat.risk_map(), -2.5, 0.0)
-    assert np.array_equal(first.unseen, flat.state == UNKNOWN)
-    assert first.unseen[hole] and not first.ground[far], "known and out of reach is not unseen"
-    known = flat.state != UNKNOWN
+    assert not (first.hopeful & (flat.state != UNKNOWN)).any()
+    assert first.hopeful[hole]
+    assert not first.hopeful[beside_the_wall], "its body would touch the wall"
+    assert not first.hopeful[far], "the way there is a slit of 0.4 m"
+    assert not first.hopeful[0].any(), "behind the walls"
     flat.fill(-9.0, -9.0, 9.0, 9.0, UNKNOWN)
     forgotten = belief.window(flat.risk_map(), -2.5, 0.0)
-    assert np.array_equal(forgotten.unseen, ~known), "what is forgotten was seen"
-    flat.fill(2.0, -1.0, 3.0, 1.0, FREE)
-    assert not belief.window(flat.risk_map(), -2.5, 0.0).unseen[hole]
+    assert not forgotten.hopeful[flat.spec.cell_of(-2.5, 1.0)], "what is forgotten was seen"
+    assert forgotten.hopeful[hole], "as far as obstacles are known"
+    flat.fill(-1.2, -1.0, -0.2, 1.0, FREE)
+    assert not belief.window(flat.risk_map(), -2.5, 0.0).hopeful[hole]
 
 
 @settings(max_examples=15)

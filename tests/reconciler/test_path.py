@@ -113,6 +113,19 @@ def test_smoothing_shortens_a_zigzag_and_bends_a_corner() -> None:
     assert turns.max() < math.radians(40.0)
 
 
+def test_smoothing_goes_through_pinned_points_and_keeps_their_corners() -> None:
+    """A look back from a place a little aside: a smooth line would pass it by under another heading."""
+    ground = ground_of(np.zeros((100, 100), np.bool_))
+    line = np.array([(1.0, 1.0), (2.0, 1.0), (2.0, 0.7), (3.0, 1.0), (4.0, 1.0)])
+    free, pinned = smooth(line, 0, ground, CONFIG), smooth(line, 0, ground, CONFIG, np.array([1, 2]))
+    for point in line[1:3]:
+        assert np.hypot(*(pinned - point).T).min() < 1e-9
+    assert np.hypot(*(free - line[2]).T).min() > 0.1
+    assert np.abs(np.sin(headings(pinned)) + 1.0).min() < 1e-9, "it heads south on the way between the two"
+    fixed = smooth(line, 3, ground, CONFIG, np.array([0, 2, 4]))
+    assert fixed[:3].tobytes() == line[:3].tobytes()
+
+
 def test_smoothing_pushes_a_line_off_a_wall() -> None:
     lethal = np.zeros((60, 100), np.bool_)
     lethal[:30] = True
