@@ -20,6 +20,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict
 
+from planning.robot_profile import PROFILES
 from plgrim.config_keys import check_env_name, check_keys, describe
 from plgrim.errors import ConfigError
 from plgrim.registry import STAGES
@@ -98,6 +99,8 @@ class Config(BaseSettings):
 
     robot: str = Field("robot", pattern=r"^[A-Za-z0-9_-]{1,32}$")
     """Name of the robot: part of every key on the wire."""
+    profile: Literal["husky", "spot"] = "spot"
+    """The robot's body: what the simulator moves and what the planners take it for."""
     seed: int = Field(1, ge=0, lt=2**63)
     """The mission's seed; every random stream is derived from it."""
     router: RouterConfig = RouterConfig()
@@ -127,11 +130,31 @@ class Config(BaseSettings):
         return (init_settings, _EnvironmentSource(settings_cls), _FileSource(settings_cls))
 
     def options(self, service: str) -> dict[str, Any]:
-        """The section of a service; the simulator's seed is the mission's unless it has its own."""
+        """The section of a service, with what is said once for all: seed and robot profile; a section may differ.
+
+        In a simulated world of rough ground the risk map is one of terrain.
+        """
         section: dict[str, Any] = dict(getattr(self, service))
         if service == "sim":
             section.setdefault("seed", self.seed)
+            section["robot"] = {"profile": self.profile, **section.get("robot", {})}
+        elif service == "riskmap":
+            section.setdefault("profile", self.profile)
+            section.setdefault("model", "terrain" if is_rough(self.sim) else "flat")
+        elif service == "reconciler":
+            section.setdefault("footprint_radius_m", PROFILES[self.profile].footprint_radius_m)
         return section
+
+
+def is_rough(sim: Mapping[str, Any]) -> bool:
+    """Whether this section of the simulator asks for a world with heights."""
+    if sim.get("map_file"):
+        return False
+    return bool(sim.get("mesh_file") or sim.get("dem_file")) or sim.get("world") in ROUGH_WORLDS
+
+
+ROUGH_WORLDS = ("cave", "lava_tube")
+"""Built-in worlds whose ground is not flat."""
 
 
 class _FileSource(PydanticBaseSettingsSource):

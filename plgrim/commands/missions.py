@@ -55,7 +55,7 @@ def explore(
     put(overrides, "sim.map_file", None if map_file is None else str(map_file.resolve()))
     put(overrides, "sim.mesh_file", None if mesh is None else str(mesh.resolve()))
     put(overrides, "sim.dem_file", None if dem is None else str(dem.resolve()))
-    put(overrides, "sim.robot.profile", robot)
+    put(overrides, "profile", robot)
     put(overrides, "sim.start", None if start is None else {"x_m": start[0], "y_m": start[1]})
     put(overrides, "mission.time_budget_s", time_budget)
     config = _prepare(config_file, overrides)

@@ -25,6 +25,12 @@ class Config(BaseModel):
     switch_margin: float = Field(
         12.0, ge=0, le=1000, description="better by this much too, nats: more keeps the target longer."
     )
+    crumb_share: float = Field(
+        0.1, ge=0, le=1, description="Of a target that promises less than this share of what it once did,"
+    )
+    crumb_margin: float = Field(
+        0.5, ge=0, le=1000, description="twice as far as the best: that must be better by this, nats."
+    )
     same_target_m: float = Field(
         2.0, gt=0, le=20, description="A frontier so near to the target's place is the same target, m."
     )

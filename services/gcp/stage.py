@@ -37,10 +37,11 @@ def create(config: Config, setup: StageSetup) -> Stage:
 
 
 class _Target(NamedTuple):
-    """The frontier that the robot is sent to. id -1: none."""
+    """The frontier that the robot is sent to. id -1: none. gain: the most that it has promised since it was chosen."""
 
     id: int = -1
     xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gain: float = 0.0
 
 
 class _Choice(NamedTuple):
@@ -163,20 +164,29 @@ class GcpStage:
                 else f"frontier {self._target.id} is covered or out of reach"
             )
             return _Choice(best, f"{says}; {why}", alternatives=shown)
-        margin = max(self.config.switch_margin, self.config.switch_margin_relative * abs(kept.q))
+        margin = self._margin(kept, best)
         if best.node == kept.node or best.q <= kept.q + margin:
             return _Choice(kept, f"{_describe(planner, kept)}; kept", alternatives=shown)
         why = f"switched, Q {best.q:.2f} against {kept.q:.2f} of {_describe(planner, kept)}"
         gap_m = float(np.linalg.norm(planner.road_map.xyz_m[best.node] - np.array(self._target.xyz_m)))
         return _Choice(best, f"{says}; {why}", gap_m > self.config.same_target_m, shown)
 
+    def _margin(self, kept: Option, best: Option) -> float:
+        """How much better the best must be. A crumb that is left of the target far away is no reason to pass others."""
+        crumb = kept.gain < self.config.crumb_share * self._target.gain
+        if crumb and kept.distance_m > 2.0 * best.distance_m:
+            return self.config.crumb_margin
+        return max(self.config.switch_margin, self.config.switch_margin_relative * abs(kept.q))
+
     def _remember(self, planner: GlobalPlanner, choice: _Choice) -> None:
         """Hold the frontier chosen; on the way home nothing is held."""
-        self._target = _Target()
+        before, self._target = self._target, _Target()
         if choice.option is not None and choice.extra_xyz_m is None:
             xyz = planner.road_map.xyz_m[choice.option.node]
             place = (float(xyz[0]), float(xyz[1]), float(xyz[2]))
-            self._target = _Target(int(planner.road_map.node_id[choice.option.node]), place)
+            name = int(planner.road_map.node_id[choice.option.node])
+            held = before.gain if name == before.id else 0.0
+            self._target = _Target(name, place, max(held, choice.option.gain))
 
     def _message(
         self,
@@ -221,7 +231,7 @@ class GcpStage:
         return pack_snapshot(
             {
                 "graph": self._mirror.snapshot(),
-                "target": [self._target.id, *self._target.xyz_m],
+                "target": [self._target.id, *self._target.xyz_m, self._target.gain],
                 "tick": self._tick,
                 "asked_ns": self._asked_ns,
             }
@@ -231,19 +241,21 @@ class GcpStage:
         """Go on from a snapshot."""
         state = unpack_snapshot(snapshot)
         self._mirror.restore(state["graph"])
-        target, x_m, y_m, z_m = state["target"]
-        self._target = _Target(target, (x_m, y_m, z_m))
+        target, x_m, y_m, z_m, gain = state["target"]
+        self._target = _Target(target, (x_m, y_m, z_m), gain)
         self._tick, self._asked_ns = state["tick"], state["asked_ns"]
 
     def journal(self, outputs: Outputs) -> bytes:
         """The target held; the graph comes again from irm."""
-        return pack_snapshot({"target": [self._target.id, *self._target.xyz_m], "tick": self._tick})
+        return pack_snapshot(
+            {"target": [self._target.id, *self._target.xyz_m, self._target.gain], "tick": self._tick}
+        )
 
     def replay(self, record: bytes) -> None:
         """Take in a record of the journal."""
         state = unpack_snapshot(record)
-        target, x_m, y_m, z_m = state["target"]
-        self._target, self._tick = _Target(target, (x_m, y_m, z_m)), state["tick"]
+        target, x_m, y_m, z_m, gain = state["target"]
+        self._target, self._tick = _Target(target, (x_m, y_m, z_m), gain), state["tick"]
 
 
 def _robot_xyz(odometry: Odometry) -> tuple[float, float, float]:

@@ -197,6 +197,27 @@ def test_by_default_a_target_is_kept_for_one_that_is_better_by_ten_nats() -> Non
     assert policy.target == 11
 
 
+@pytest.mark.parametrize(
+    ("left", "near_m", "switches"), [(0.5, 10.0, True), (5.0, 10.0, False), (0.5, 30.0, False)]
+)
+def test_a_crumb_of_a_far_target_is_no_reason_to_pass_others(
+    left: float, near_m: float, switches: bool
+) -> None:
+    """Chosen for 20 nats, it has `left` of them: the frontier on the way is better, but by less than the margins."""
+
+    def world(version: int, gain: float) -> GlobalIrm:
+        nodes: dict[int, Node] = {
+            1: (CRUMB, 0.0, 0.0, 0.0), 10: (FRONTIER, 45.0, 0.0, gain), 11: (FRONTIER, near_m, 0.0, 6.0),
+        }  # fmt: skip
+        return graph(version, nodes, {(1, 10): (45.0, 0.0), (1, 11): (near_m, 0.0)})
+
+    bench = Bench()
+    assert bench.step((GLOBAL_IRM, world(1, 20.0))).target == 10
+    policy = bench.step((GLOBAL_IRM, world(2, left)))
+    assert policy.switched == switches
+    assert policy.target == (11 if switches else 10)
+
+
 def test_a_target_that_is_gone_is_replaced_without_a_switch() -> None:
     bench = Bench()
     bench.step((GLOBAL_IRM, fork()))
