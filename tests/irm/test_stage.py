@@ -52,8 +52,9 @@ def feeds(
     keyframes: dict[int, Planar] | None = None,
     scans: tuple[tuple[int, float], ...] = (),
     stale: bool = False,
+    keyframe_at: Planar = ORIGIN,
 ) -> Inputs:
-    """Risk map, odometry, pose graph, and scans given as (keyframe, yaw)."""
+    """Risk map, odometry, pose graph, and scans given as (keyframe, yaw). keyframe_at: of a keyframe still to come."""
     parts = [
         inputs((RISK_MAP, flat.risk_map(x_m, y_m, stamp_ns=7)), stale=stale),
         inputs((ODOMETRY, odometry(x_m, y_m))),
@@ -61,7 +62,8 @@ def feeds(
     if keyframes is not None:
         parts.append(inputs((POSE_GRAPH, pose_graph(keyframes))))
     for keyframe, yaw in scans:
-        parts.append(inputs((COVERAGE_SCAN, scan_at(Planar(x_m, y_m, yaw), keyframe, fov_rad=2.0))))
+        at = (keyframes or {}).get(keyframe, keyframe_at)
+        parts.append(inputs((COVERAGE_SCAN, scan_at(Planar(x_m, y_m, yaw), keyframe, at, fov_rad=2.0))))
     return merged(*parts)
 
 
@@ -162,9 +164,10 @@ def test_looks_cover_ground_until_no_frontier_is_left() -> None:
 
 def test_a_moved_keyframe_moves_what_is_covered() -> None:
     stage, flat = IrmStage(CONFIG), room(-4.0, -4.0, 4.0, 4.0, 0.2)
-    outputs = stage.step(0, feeds(flat, -2.0, 0.1, {0: ORIGIN}, ((0, 0.0), (0, 2.0), (0, 4.0))))
+    stays = Planar(0.5, 0.5, 0.0)  # the newest keyframe, which the robot is at
+    outputs = stage.step(0, feeds(flat, -2.0, 0.1, {0: ORIGIN, 1: stays}, ((0, 0.0), (0, 2.0), (0, 4.0))))
     before = one(outputs, COVERAGE_WINDOW)
-    outputs = stage.step(SECOND_NS, feeds(flat, -2.0, 0.1, {0: Planar(1.0, 0.4, 0.0)}))
+    outputs = stage.step(SECOND_NS, feeds(flat, -2.0, 0.1, {0: Planar(1.0, 0.4, 0.0), 1: stays}))
     after = one(outputs, COVERAGE_WINDOW)
     assert isinstance(before, CoverageWindow) and isinstance(after, CoverageWindow)
     seen, moved = before.cell == 2, after.cell == 2
@@ -198,7 +201,8 @@ def drive(k: int) -> dict[str, Any]:
     """The inputs of step k of a short drive: scans whose keyframes come one step late."""
     x = -2.5 + 0.1 * k
     keyframes = {i: Planar(-2.5 + 0.1 * i + (0.2 if k >= 9 else 0.0), 0.0, 0.0) for i in range(k)}
-    return {"x_m": x, "keyframes": keyframes, "scans": ((k, 0.3 * k), (k, 2.0 + 0.3 * k))}
+    scans = ((k, 0.3 * k), (k, 2.0 + 0.3 * k))
+    return {"x_m": x, "keyframes": keyframes, "scans": scans, "keyframe_at": Planar(x, 0.0, 0.0)}
 
 
 @pytest.mark.parametrize("at", [1, 6, 9])
