@@ -35,7 +35,9 @@ STEPS = len(lap())
 
 
 class Loop:
-    """A robot that drives around the ring (without its dead end, which is seen or not by a hair's breadth) with a drifting odometry, and a SLAM that closes the loop when told to.
+    """A robot that drives around the ring with a drifting odometry, and a SLAM that closes the loop when told to.
+
+    The ring's dead end is filled: what is seen of it hangs on a hair's breadth.
 
     drift: x, y, yaw that dead reckoning errs by per metre.
     """
