@@ -78,7 +78,15 @@ class RuntimeConfig(_Section):
     """Restarts of one service allowed within `restart_window_s`; one more ends the run."""
     restart_window_s: float = Field(120.0, gt=0)
     backoff_s: float = Field(0.5, ge=0)
-    """Wait before the first restart; doubles with each further one."""
+    """Wait before a restart of what failed soon after its start; doubles with each further failure in a row."""
+    stable_after_s: float = Field(10.0, ge=0)
+    """A service that was ready for so long is restarted at once when it ends; `restarts` counts it all the same."""
+    state_dir: str = ""
+    """Where services keep their journals, to go on after a crash: `<state_dir>/<robot>/<service>.*`. Empty: a service
+    started by itself keeps none; `up`, `explore` and `demo` use a fresh folder `state` in their result folder."""
+    snapshot_period_s: float = Field(5.0, gt=0, le=600)
+    """Between two snapshots of a stage's state; longer of itself where snapshots are expensive. What is acknowledged is
+    journaled in between; the rest (frames of the risk map, a plan) is at most so much older after a restart."""
     stop_timeout_s: float = Field(3.0, gt=0)
     """Grace between SIGTERM and SIGKILL."""
 

@@ -39,5 +39,13 @@ class ServiceFailedError(PlgrimError):
     exit_code = 6
 
 
-FATAL_EXIT_CODES = frozenset({ConfigError.exit_code, AlreadyRunningError.exit_code, PortTakenError.exit_code})
+class JournalError(PlgrimError):
+    """A journal cannot be written: no space, no permission."""
+
+    exit_code = 7
+
+
+FATAL_EXIT_CODES = frozenset(
+    error.exit_code for error in (ConfigError, AlreadyRunningError, PortTakenError, JournalError)
+)
 """Exit codes of a service that a restart cannot mend."""

@@ -15,6 +15,7 @@ from plgrim.evaluation.recorder import RECORDED, MissionRecorder
 from plgrim.logs import get_logger
 from plgrim.progress import MissionProgress
 from plgrim.registry import STAGES
+from plgrim.runtime.router import page_address
 from plgrim.runtime.supervisor import Command, Supervisor, plgrim_command
 from plgrim.runtime.zenoh_session import Link, connect
 from schemas.base import Message
@@ -50,8 +51,7 @@ def status_address(config: Config) -> tuple[str, int]:
 
 def status_page(config: Config) -> str:
     """Address of the status page as a person on this host opens it."""
-    host, port = status_address(config)
-    return f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else host}:{port}/"
+    return page_address(*status_address(config))
 
 
 def attach_recorder(link: Link, recorder: MissionRecorder) -> None:
@@ -63,7 +63,7 @@ def attach_recorder(link: Link, recorder: MissionRecorder) -> None:
         except MessageError as error:
             get_logger().warning("recorder: message refused", topic=topic.name, reason=str(error))
             return
-        recorder.observe(topic, message, envelope.sent_ns)
+        recorder.observe(topic, message, envelope.sent_ns, envelope.epoch)
 
     for topic in RECORDED:
         link.subscribe(topic, receive, every=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 from schemas.base import Message
 
@@ -23,7 +23,8 @@ class Topic(Generic[M_co]):
     name: writer/noun, unique. message: its schema. writer: the one service that may write it. readers: services that
     get it. period_ns: expected time between messages (0: on events). keep_all: every message is delivered in order;
     otherwise only the latest. max_bytes: a larger message is refused. stale_after_ns: age since receipt from which it
-    no longer counts (0: never). crosses_link: forwarded between robot and base station.
+    no longer counts (0: never). crosses_link: forwarded between robot and base station. journaled: what a message says
+    is acknowledged: its writer has it on the disk before it is published, and still knows it after a restart.
     """
 
     name: str
@@ -36,6 +37,7 @@ class Topic(Generic[M_co]):
     stale_after_ns: int
     crosses_link: bool
     says: str
+    journaled: bool = False
 
     def key(self, robot: str) -> str:
         """The Zenoh key expression: `plgrim/@v1/<robot>/<service>/<noun>`."""
@@ -136,6 +138,36 @@ class Stage(Protocol):
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot."""
+        ...
+
+
+@runtime_checkable
+class Journaling(Protocol):
+    """What a stage offers beside `Stage` so that nothing that it has acknowledged is lost between two snapshots."""
+
+    def journal(self, outputs: Outputs) -> bytes:
+        """A record of what must survive for these outputs to stay true.
+
+        Together with the last snapshot and the records since then it leads to the state that the outputs tell of. The
+        driver writes it before it publishes them; asked only when one of them is of a journaled topic.
+        """
+        ...
+
+    def replay(self, record: bytes) -> None:
+        """Take in a record, after `restore` and in the order in which they were written."""
+        ...
+
+
+@runtime_checkable
+class Resuming(Protocol):
+    """For a stage that must know when it goes on after the death of its process."""
+
+    def resumed(self) -> None:
+        """Called once after `restore` and `replay`, but not when lock-step restores all stages at once.
+
+        Others may have heard what was said since the last record: numbers that must not be given twice are skipped,
+        and what does not survive a pause is dropped.
+        """
         ...
 
 

@@ -13,12 +13,15 @@ class PointCloud(Message):
     """One LiDAR sweep. Points that hit nothing are absent.
 
     points_m: (n, 3) x, y, z in the sensor's frame. sensor_in_odom: the sensor's pose in `odom` when the sweep was
-    taken, extrinsics included. range_m: beyond it the sensor returns nothing.
+    taken, extrinsics included (6 degrees of freedom). sensor_in_base: the extrinsics, the sensor's pose in base_link.
+    range_m: beyond it the sensor returns nothing.
     """
 
     schema_name: ClassVar[str] = "point_cloud"
+    schema_version: ClassVar[int] = 2
 
     sensor_in_odom: Pose
+    sensor_in_base: Pose = Pose(z_m=0.8)
     ground_z_m: float = Field(0.0, description="Height of the ground under the robot in odom, m.")
     range_m: float = Field(gt=0, le=1000)
     points_m: F32Points

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import msgpack
 import numpy as np
 
+from schemas.base import Message
+from schemas.codec import Envelope, decode, encode
 from schemas.errors import MalformedError
 
 _ARRAY = "__array__"
+_ENVELOPE = Envelope("", "", 0, 0, 0)
+_M = TypeVar("_M", bound=Message)
 
 
 def pack_snapshot(state: dict[str, Any]) -> bytes:
@@ -27,6 +31,16 @@ def unpack_snapshot(payload: bytes) -> dict[str, Any]:
     if not isinstance(state, dict):
         raise MalformedError("snapshot: not a map")
     return state
+
+
+def pack_message(message: Message) -> bytes:
+    """A message that a stage keeps, as bytes for its snapshot."""
+    return encode(message, _ENVELOPE)
+
+
+def unpack_message(payload: bytes, expected: type[_M]) -> _M:
+    """The message in a snapshot; its arrays are read-only, as those that were received. Raises `MessageError`."""
+    return decode(payload, expected, len(payload))[0]
 
 
 def _array(value: Any) -> dict[str, Any]:

@@ -30,6 +30,7 @@ def _topic(
     max_bytes: int = 256 * _KIB,
     keep_all: bool = False,
     link: bool = False,
+    journaled: bool = False,
 ) -> Topic[Any]:
     return Topic(
         name=name,
@@ -42,6 +43,7 @@ def _topic(
         stale_after_ns=stale_ms * _MS,
         crosses_link=link,
         says=says,
+        journaled=journaled,
     )
 
 
@@ -59,6 +61,7 @@ ODOMETRY: Topic[Odometry] = _topic(
 )  # fmt: skip
 POSE_GRAPH: Topic[PoseGraph] = _topic(
     PoseGraph, "sim/pose_graph", "irm", "SLAM keyframes", period_ms=500, max_bytes=16 * _MIB, link=True,
+    journaled=True,
 )  # fmt: skip
 COVERAGE_SCAN: Topic[CoverageScan] = _topic(
     CoverageScan, "sim/coverage_scan", "irm", "the coverage sensor has looked", period_ms=100, keep_all=True,
@@ -70,7 +73,7 @@ FOLLOWER: Topic[FollowerState] = _topic(
 )  # fmt: skip
 JUDGE: Topic[JudgeReport] = _topic(
     JudgeReport, "sim/judge", "status", "ground truth: true coverage, lost or not", period_ms=500,
-    max_bytes=16 * _KIB, link=True,
+    max_bytes=16 * _KIB, link=True, journaled=True,
 )  # fmt: skip
 WORLD_PICTURE: Topic[WorldPicture] = _topic(
     WorldPicture, "sim/world_picture", "", "the true world, for the result's picture", period_ms=5000,
@@ -86,7 +89,7 @@ LOCAL_IRM: Topic[LocalIrm] = _topic(
 )  # fmt: skip
 GLOBAL_IRM: Topic[GlobalIrm] = _topic(
     GlobalIrm, "irm/global_irm", "gcp status mission", "the Global IRM, whole or as differences", period_ms=1000,
-    stale_ms=10_000, max_bytes=32 * _MIB, keep_all=True, link=True,
+    stale_ms=10_000, max_bytes=32 * _MIB, keep_all=True, link=True, journaled=True,
 )  # fmt: skip
 COVERAGE: Topic[CoverageSummary] = _topic(
     CoverageSummary, "irm/coverage", "mission status gcp", "coverage by the belief, what is left and why",
@@ -98,7 +101,7 @@ COVERAGE_WINDOW: Topic[CoverageWindow] = _topic(
 )  # fmt: skip
 GLOBAL_POLICY: Topic[GlobalPolicy] = _topic(
     GlobalPolicy, "gcp/global_policy", "irm lcp mission status reconciler", "the QMDP policy, its target and why",
-    period_ms=1000, stale_ms=10_000, max_bytes=16 * _MIB, link=True,
+    period_ms=1000, stale_ms=10_000, max_bytes=16 * _MIB, link=True, journaled=True,
 )  # fmt: skip
 GCP_GRAPH_REQUEST: Topic[GraphRequest] = _topic(
     GraphRequest, "gcp/graph_request", "irm", "gcp asks for the whole Global IRM", period_ms=0, keep_all=True,
@@ -125,7 +128,7 @@ PLAN: Topic[Plan] = _topic(
 )  # fmt: skip
 MISSION: Topic[MissionState] = _topic(
     MissionState, "mission/state", "irm gcp lcp reconciler status sim", "phase, budget, finish reason",
-    period_ms=500, stale_ms=3000, link=True,
+    period_ms=500, stale_ms=3000, link=True, journaled=True,
 )  # fmt: skip
 COMMAND: Topic[MissionCommand] = _topic(
     MissionCommand, "status/command", "mission", "what the operator asks", period_ms=0, keep_all=True,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 import urllib.error
@@ -28,11 +29,20 @@ def status(
 
     address = (url or status_page(load_config(config_file))).rstrip("/")
     try:
-        print(json.dumps(_get(f"{address}/api/v1/status"), indent=2))
+        answer = json.dumps(_get(f"{address}/api/v1/status"), indent=2)
     except (OSError, ValueError) as error:
         raise PlgrimError(
             f"no status at {address}: {error}; is the mission running (`plgrim up`)?"
         ) from error
+    _print(answer)
+
+
+def _print(text: str) -> None:
+    """Print; a reader that has seen enough (`plgrim status | head`) is no error."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains when it ends
 
 
 def _get(address: str) -> Any:

@@ -80,12 +80,12 @@ class MissionRecorder:
         self._track: list[tuple[float, ...]] = []
         self._zero_ns: Stamp | None = None
 
-    def observe(self, topic: Topic[Any], message: Message, now: Stamp) -> None:
-        """Take in a message. now: mission clock when it was sent, ns."""
+    def observe(self, topic: Topic[Any], message: Message, now: Stamp, epoch: int = 0) -> None:
+        """Take in a message. now: mission clock when it was sent, ns. epoch: which life of its writer."""
         with self._lock:
-            self._observe(message, now)
+            self._observe(message, now, epoch)
 
-    def _observe(self, message: Message, now: Stamp) -> None:
+    def _observe(self, message: Message, now: Stamp, epoch: int) -> None:
         match message:
             case JudgeReport():
                 self.judge = message
@@ -108,7 +108,7 @@ class MissionRecorder:
             case WorldPicture():
                 self.picture = message
             case StageHealth():
-                self._add_health(message)
+                self._add_health(message, epoch)
 
     def _elapsed_s(self, now: Stamp) -> float:
         """Time since the mission's start; before its state has come, since the first message that counts."""
@@ -138,10 +138,11 @@ class MissionRecorder:
             self._risk_stamp_ns = plan.risk_stamp_ns
             self._latency_s.append((now - plan.risk_stamp_ns) / SECOND_NS)
 
-    def _add_health(self, health: StageHealth) -> None:
+    def _add_health(self, health: StageHealth, epoch: int) -> None:
+        """Counters are those of one life; by its epoch, since in containers every process has the same id."""
         self.health[health.service] = health
-        self._errors[health.service, health.pid] = health.errors
-        self._dropped[health.service, health.pid] = health.dropped
+        self._errors[health.service, epoch] = health.errors
+        self._dropped[health.service, epoch] = health.dropped
         self._memory_mb[health.service] = max(self._memory_mb.get(health.service, 0.0), health.memory_mb)
 
     @property

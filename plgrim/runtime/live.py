@@ -16,6 +16,7 @@ from plgrim.config import Config, check_service
 from plgrim.errors import ServiceFailedError
 from plgrim.logs import get_logger
 from plgrim.registry import stage_module, world_errors
+from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.mailbox import Mailbox, Outbox
 from plgrim.runtime.process import Interrupted, interruptible
 from plgrim.runtime.service import LiveService
@@ -52,23 +53,42 @@ def drive(name: str, config: Config, make: MakeStage, stop: threading.Event) -> 
     what `make` raises.
     """
     with LiveService(name, config, stop) as service:
+        keeper = Keeper.of(config.runtime, config.robot, name)
         try:
             with interruptible(stop):
-                spec, stage = make()
+                spec, stage = _make(make, keeper, service.clock.now_ns())
         except Interrupted:
             return
-        LiveDriver(service, spec, stage).run(stop)
+        LiveDriver(service, spec, stage, keeper).run(stop)
+
+
+def _make(make: MakeStage, keeper: Keeper | None, now: Stamp) -> tuple[StageSpec, Stage]:
+    """The stage: as it was when its process died if a keeper knows, else new."""
+    if keeper is None:
+        return make()
+    specs: list[StageSpec] = []
+
+    def stage() -> Stage:
+        spec, made = make()
+        specs.append(spec)
+        return made
+
+    recovered = keeper.recover(stage, now)
+    return specs[-1], recovered
 
 
 class LiveDriver:
     """Steps a stage at its period and when a trigger arrives; publishes what it gives."""
 
-    def __init__(self, service: LiveService, spec: StageSpec, stage: Stage) -> None:
+    def __init__(
+        self, service: LiveService, spec: StageSpec, stage: Stage, keeper: Keeper | None = None
+    ) -> None:
         config = service.config
         self._service = service
         self._clock = service.clock
         self._spec = spec
         self._stage = stage
+        self._keeper = keeper
         self._mailbox = Mailbox(config.robot, tuple(read_by(service.name)))
         self._outbox = Outbox(config.robot, service.name, service.epoch)
         self._wake = threading.Condition()
@@ -86,6 +106,14 @@ class LiveDriver:
         self._service.mailbox_report = self._mailbox_report
         self._service.monitor.ready = True
         self._log.info("ready", period_ms=self._spec.period_ns / 1e6, topics=len(self._mailbox.topics))
+        try:
+            self._run(stop)
+        finally:
+            if self._keeper is not None:
+                self._keeper.close()
+        self._log.info("stopped", steps=self._service.monitor.steps)
+
+    def _run(self, stop: threading.Event) -> None:
         due = self._clock.now_ns()
         while not stop.is_set():
             triggered = self._wait(due, stop)
@@ -94,7 +122,8 @@ class LiveDriver:
             began = self._clock.now_ns()
             self._step(began)
             due = next_due(self._spec.period_ns, due, began, self._clock.now_ns(), triggered)
-        self._log.info("stopped", steps=self._service.monitor.steps)
+        if self._keeper is not None and not self._errors_in_a_row:
+            self._keeper.close(self._stage, self._clock.now_ns())
 
     def _accept(self, topic: Topic[Message], payload: bytes) -> None:
         with self._wake:
@@ -126,6 +155,8 @@ class LiveDriver:
         monitor.step_began()
         try:
             self._publish(inputs, now)
+            if self._keeper is not None:
+                self._keeper.after_step(self._stage, now)
             self._errors_in_a_row = 0
         except Exception as error:
             self._failed(error)
@@ -133,8 +164,12 @@ class LiveDriver:
             monitor.step_ended()
 
     def _publish(self, inputs: Inputs, now: Stamp) -> None:
-        for output in self._stage.step(now, inputs):
-            payload = self._outbox.pack(output, self._clock.now_ns(), inputs.consumed)
+        """Step, write down what is acknowledged, and only then say it."""
+        found = self._stage.step(now, inputs)
+        payloads = [self._outbox.pack(output, self._clock.now_ns(), inputs.consumed) for output in found]
+        if self._keeper is not None:
+            self._keeper.before_publishing(self._stage, found)
+        for output, payload in zip(found, payloads, strict=True):
             try:
                 self._service.link.publish(output.topic, payload)
             except zenoh.ZError as error:

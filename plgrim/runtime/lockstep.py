@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +19,8 @@ from plgrim.registry import STAGES, make_stage
 from plgrim.runtime.mailbox import Mailbox, Outbox
 from schemas.base import Message
 from schemas.contract import Stage, StageSetup, StageSpec, Stamp, Topic
-from schemas.topics import TOPICS, read_by
+from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.topics import TOPICS, read_by, topic_named
 
 Observer = Callable[[Topic[Message], Message, Stamp], None]
 
@@ -38,7 +39,8 @@ class _Runner:
 class Lockstep:
     """Runs stages under a virtual clock.
 
-    options: configuration by service. observer: called with every message when a stage has made it.
+    options: configuration by service. observer: called with every message when a stage has made it. extra: stages that
+    are given instead of made, by the service whose place they take (they write its topics).
     digest(): hash of every byte that was published, to compare runs.
     """
 
@@ -49,15 +51,18 @@ class Lockstep:
         robot: str = "robot",
         observer: Observer | None = None,
         stages: tuple[str, ...] = STAGES,
+        extra: Mapping[str, tuple[StageSpec, Stage]] | None = None,
     ) -> None:
         self.now: Stamp = 0
         self._observer = observer
-        self._hash = xxhash.xxh3_128()
+        self._digest = b""
         self._order = 0
         self._pending: list[tuple[Stamp, int, Topic[Message], bytes]] = []
         self._runners: dict[str, _Runner] = {}
-        for name in stages:
-            spec, stage = make_stage(name, options.get(name, {}), StageSetup(robot, seed))
+        given = dict(extra or {})
+        for name in (*stages, *(n for n in given if n not in stages)):
+            setup = StageSetup(robot, seed)
+            spec, stage = given[name] if name in given else make_stage(name, options.get(name, {}), setup)
             mailbox = Mailbox(robot, tuple(read_by(name)))
             outbox = Outbox(robot, name, 1)
             self._runners[name] = _Runner(spec, stage, mailbox, outbox, 0, frozenset(spec.triggers))
@@ -85,7 +90,7 @@ class Lockstep:
     def _release(self) -> None:
         while self._pending and self._pending[0][0] <= self.now:
             _, _, topic, payload = heapq.heappop(self._pending)
-            self._hash.update(topic.name.encode() + payload)
+            self._digest = xxhash.xxh3_128_digest(self._digest + topic.name.encode() + payload)
             for runner in self._readers[topic.name]:
                 if runner.mailbox.accept(topic, payload, self.now) and topic.name in runner.triggers:
                     runner.due_ns = self.now
@@ -119,4 +124,43 @@ class Lockstep:
 
     def digest(self) -> str:
         """Hash of every published byte in order."""
-        return self._hash.hexdigest()
+        return self._digest.hex()
+
+    def snapshot(self) -> bytes:
+        """The whole run between two calls of `run_until`: stages, what they have received, what is under way."""
+        runners = {
+            name: {
+                "stage": runner.stage.snapshot(),
+                "mailbox": runner.mailbox.state(),
+                "sequence": dict(runner.outbox.sequence),
+                "due_ns": runner.due_ns,
+            }
+            for name, runner in self._runners.items()
+        }
+        pending = [[due, order, topic.name, payload] for due, order, topic, payload in self._pending]
+        return pack_snapshot(
+            {
+                "now": self.now,
+                "order": self._order,
+                "digest": self._digest,
+                "pending": pending,
+                "runners": runners,
+            }
+        )
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot of a run with the same options, seed and stages: every byte is as if never stopped.
+
+        Raises MalformedError when it is damaged, KeyError when it is of other stages.
+        """
+        state = unpack_snapshot(snapshot)
+        for name, runner in self._runners.items():
+            held = state["runners"][name]
+            runner.stage.restore(held["stage"])
+            runner.mailbox.set_state(held["mailbox"])
+            runner.outbox.sequence = Counter(held["sequence"])
+            runner.due_ns = held["due_ns"]
+        self._pending = [
+            (due, order, topic_named(name), payload) for due, order, name, payload in state["pending"]
+        ]
+        self.now, self._order, self._digest = state["now"], state["order"], state["digest"]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from dataclasses import dataclass, field
+from typing import Any
 
 from schemas.base import Message
 from schemas.codec import Envelope, decode, encode
@@ -86,6 +87,26 @@ class Mailbox:
                 queue.popleft()
             queue[-1].fresh = False
 
+    def state(self) -> dict[str, Any]:
+        """For a snapshot: what is held, as the bytes that were received, and what was refused."""
+        held = {
+            name: [[encode(h.message, h.envelope), h.received_ns, h.fresh] for h in queue]
+            for name, queue in sorted(self._held.items())
+        }
+        return {"held": held, "dropped": dict(self.dropped)}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """From a snapshot. Raises MessageError."""
+        self.dropped = Counter(state["dropped"])
+        self._held = {}
+        for topic in self.topics:
+            if topic.name not in state["held"]:
+                continue
+            queue = self._held[topic.name] = deque()
+            for payload, received_ns, fresh in state["held"][topic.name]:
+                message, envelope = decode(payload, topic.message, topic.max_bytes)
+                queue.append(_Held(message, envelope, received_ns, fresh))
+
     def missing(self, now_ns: int) -> list[str]:
         """Periodic topics of which nothing has come, or only something stale."""
         found = []
@@ -107,21 +128,22 @@ def _received(topic: Topic[Message], held: _Held, now_ns: int) -> Received[Messa
 
 @dataclass(slots=True)
 class Outbox:
-    """Gives a stage's outputs their envelopes: writer, epoch, sequence, inputs consumed."""
+    """Gives a stage's outputs their envelopes: writer, epoch, sequence (messages of each topic so far), inputs
+    consumed."""
 
     robot: str
     service: str
     epoch: int
-    _sequence: Counter[str] = field(default_factory=Counter)
+    sequence: Counter[str] = field(default_factory=Counter)
 
     def pack(self, output: Output, now: Stamp, consumed: dict[str, tuple[int, int]]) -> bytes:
         """The bytes of one output. ValueError when the service does not own the topic or it is too large."""
         topic = output.topic
         if topic.writer != self.service:
             raise ValueError(f"{self.service} may not write {topic.name}: it belongs to {topic.writer}")
-        self._sequence[topic.name] += 1
+        self.sequence[topic.name] += 1
         envelope = Envelope(
-            self.robot, self.service, self.epoch, self._sequence[topic.name], now, dict(consumed)
+            self.robot, self.service, self.epoch, self.sequence[topic.name], now, dict(consumed)
         )
         payload = encode(output.message, envelope)
         if len(payload) > topic.max_bytes:

@@ -47,6 +47,13 @@ def check_endpoint_free(endpoint: str) -> None:
         )
 
 
+def page_address(host: str, port: int) -> str:
+    """Address of the page as a person on this host opens it, wherever it listens."""
+    if host in ("0.0.0.0", "::"):
+        host = "127.0.0.1"
+    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+
+
 def run_router(config: RouterConfig, stop: threading.Event) -> None:
     """Route until `stop` is set. Raises PortTakenError."""
     check_endpoint_free(config.endpoint)

@@ -15,6 +15,7 @@ from plgrim.errors import AlreadyRunningError
 from plgrim.logs import get_logger
 from plgrim.runtime.clock import MissionClock
 from plgrim.runtime.health import HealthMonitor, Heartbeat, query_key, token_key
+from plgrim.runtime.keeper import next_epoch
 from plgrim.runtime.mailbox import Outbox
 from plgrim.runtime.zenoh_session import Link, connect
 from schemas.contract import Output, Stamp
@@ -25,8 +26,8 @@ from schemas.topics import health_topic
 class LiveService:
     """A service's life on the wire; a context manager.
 
-    report: gives the health message (called from the heartbeat's thread). epoch: wall-clock ms at the start, so that
-    it grows from life to life. Raises NoRouterError, AlreadyRunningError.
+    report: gives the health message (called from the heartbeat's thread). epoch: wall-clock ms at the start; it
+    grows from life to life. Raises NoRouterError, AlreadyRunningError.
     """
 
     def __init__(
@@ -35,7 +36,7 @@ class LiveService:
         self.name = name
         self.config = config
         self.clock = MissionClock.of(config.clock)
-        self.epoch = time.time_ns() // 1_000_000
+        self.epoch = next_epoch(config.runtime, config.robot, name, time.time_ns() // 1_000_000)
         self.monitor = monitor or HealthMonitor(name)
         self.mailbox_report: Callable[[Stamp], tuple[dict[str, int], list[str]]] = lambda _: ({}, [])
         self.link: Link = connect(config.router, config.robot, stop, config.runtime.router_timeout_s)

@@ -9,7 +9,9 @@ from plgrim.config import Config, check_service
 from plgrim.errors import PortTakenError
 from plgrim.logs import get_logger
 from plgrim.runtime.clock import MissionClock
+from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.mailbox import Mailbox, Outbox
+from plgrim.runtime.router import page_address
 from plgrim.runtime.service import LiveService
 from schemas.base import Message
 from schemas.contract import Output, Topic
@@ -58,19 +60,28 @@ def run_status(config: Config, stop: threading.Event) -> None:
         raise PortTakenError(f"{error} in the configuration, or PLGRIM_STATUS__PORT") from error
     try:
         with LiveService("status", config, stop) as service:
-            _serve(service, server, StatusFeed(config.robot, shared, clock), stop)
+            keeper = Keeper.of(config.runtime, config.robot, "status")
+            if keeper is not None:
+                keeper.recover(lambda: shared, service.clock.now_ns())
+            _serve(service, server, StatusFeed(config.robot, shared, clock), stop, keeper)
     finally:
         server.stop(1.0)
 
 
-def _serve(service: LiveService, server: app.StatusServer, feed: StatusFeed, stop: threading.Event) -> None:
+def _serve(
+    service: LiveService,
+    server: app.StatusServer,
+    feed: StatusFeed,
+    stop: threading.Event,
+    keeper: Keeper | None,
+) -> None:
     outbox = Outbox(service.config.robot, "status", service.epoch)
     for topic in read_by("status"):
         service.link.subscribe(topic, feed.accept)
     service.mailbox_report = feed.report
     server.start()
     service.monitor.ready = True
-    get_logger().info("ready", page=f"http://{server.shared.config.host}:{server.port}/")
+    get_logger().info("ready", page=page_address(server.shared.config.host, server.port))
     while not stop.wait(_TICK_S):
         service.monitor.step_began()
         now = service.clock.now_ns()
@@ -78,4 +89,8 @@ def _serve(service: LiveService, server: app.StatusServer, feed: StatusFeed, sto
         if request is not None:
             payload = outbox.pack(Output(STATUS_GRAPH_REQUEST, request), now, {})
             service.link.publish(STATUS_GRAPH_REQUEST, payload)
+        if keeper is not None:
+            keeper.after_step(server.shared, now)
         service.monitor.step_ended()
+    if keeper is not None:
+        keeper.close(server.shared, service.clock.now_ns())

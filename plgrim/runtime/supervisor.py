@@ -7,6 +7,7 @@ the supervisor alone; the kernel kills them when the supervisor dies. Each write
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -41,7 +42,10 @@ def plgrim_command(service: str) -> list[str]:
 
 @dataclass(slots=True)
 class Child:
-    """One process: how it is, and when it was restarted (monotonic seconds)."""
+    """One process: how it is, and when it was restarted (monotonic seconds).
+
+    failures: ends in a row of which each came soon after the start. ready_s: since when this very process is ready.
+    """
 
     name: str
     log: Path
@@ -50,8 +54,10 @@ class Child:
     restart_at_s: float | None = None
     restarts: deque[float] = field(default_factory=deque)
     restarted: int = 0
+    failures: int = 0
     health: StageHealth | None = None
     heard_s: float = 0.0
+    ready_s: float | None = None
 
     @property
     def ready(self) -> bool:
@@ -68,11 +74,25 @@ class Child:
             return ""
 
 
+def with_fresh_state(config: Config, run_folder: Path) -> Config:
+    """The configuration with an empty folder for the journals of this run: a new mission knows nothing of the last.
+
+    `state` in the run folder, which is emptied; where the user names a folder, a new one inside.
+    """
+    if config.runtime.state_dir:
+        state = Path(config.runtime.state_dir) / f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}"
+    else:
+        state = run_folder / "state"
+        shutil.rmtree(state, ignore_errors=True)
+    runtime = config.runtime.model_copy(update={"state_dir": str(state.resolve())})
+    return config.model_copy(update={"runtime": runtime})
+
+
 class Supervisor:
     """Runs the router and services; a context manager that ends them all, whatever happens.
 
-    run_folder: gets `config.yaml` (what the children read) and `logs/`. Call `poll` often; it raises
-    ServiceFailedError when a service cannot be kept alive.
+    run_folder: gets `config.yaml` (what the children read), `logs/`, and `state/` (their journals, kept only when the
+    run fails). Call `poll` often; it raises ServiceFailedError when a service cannot be kept alive.
     """
 
     def __init__(
@@ -82,7 +102,7 @@ class Supervisor:
         services: tuple[str, ...] = SERVICES,
         command: Command = plgrim_command,
     ) -> None:
-        self.config = config
+        self.config = with_fresh_state(config, run_folder)
         self._folder = run_folder
         self._command = command
         self._log = get_logger()
@@ -97,8 +117,10 @@ class Supervisor:
     def __enter__(self) -> Supervisor:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.shutdown()
+        if kind is None:
+            shutil.rmtree(self.config.runtime.state_dir, ignore_errors=True)
 
     def start(self) -> Link:
         """Start the router, connect to it, start the services. Raises PortTakenError, NoRouterError."""
@@ -169,7 +191,7 @@ class Supervisor:
         ):  # they are in config.yaml, under the command line's
             environment.pop(variable, None)
         environment["PLGRIM_CONFIG"] = str(self._folder / "config.yaml")
-        child.restart_at_s = None
+        child.restart_at_s, child.ready_s = None, None
         child.started_s = time.monotonic()
         with child.log.open("ab") as log:
             child.process = subprocess.Popen(
@@ -193,7 +215,11 @@ class Supervisor:
                 f"{child.name} ended with {code} after {len(child.restarts)} restarts within "
                 f"{runtime.restart_window_s:.0f} s. The end of {child.log}:\n{child.tail()}"
             )
-        wait = min(10.0, runtime.backoff_s * 2 ** len(child.restarts))
+        # What ran well for a while does not fail at its start: no reason to keep the robot waiting for it.
+        since = child.started_s if child.name == ROUTER else child.ready_s
+        stable = since is not None and now - since >= runtime.stable_after_s
+        child.failures = 0 if stable else child.failures + 1
+        wait = min(10.0, runtime.backoff_s * 2 ** (child.failures - 1)) if child.failures else 0.0
         child.restarts.append(now)
         child.restarted += 1
         child.restart_at_s = now + wait
@@ -215,6 +241,8 @@ class Supervisor:
             with self._lock:
                 child = self.children[message.service]
                 child.health, child.heard_s = message, time.monotonic()
+                if child.ready_s is None and child.ready:
+                    child.ready_s = child.heard_s
 
     def shutdown(self) -> None:
         """End the services, last started first, then the router; kill what does not end in time."""

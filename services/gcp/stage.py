@@ -235,6 +235,16 @@ class GcpStage:
         self._target = _Target(target, (x_m, y_m, z_m))
         self._tick, self._asked_ns = state["tick"], state["asked_ns"]
 
+    def journal(self, outputs: Outputs) -> bytes:
+        """The target held; the graph comes again from irm."""
+        return pack_snapshot({"target": [self._target.id, *self._target.xyz_m], "tick": self._tick})
+
+    def replay(self, record: bytes) -> None:
+        """Take in a record of the journal."""
+        state = unpack_snapshot(record)
+        target, x_m, y_m, z_m = state["target"]
+        self._target, self._tick = _Target(target, (x_m, y_m, z_m)), state["tick"]
+
 
 def _nodes_to_tell(
     road_map: RoadMap, robot: Floats, path: NDArray[np.int32], radius_m: float

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,18 +15,26 @@ from services.irm.config import Config
 from services.irm.window import Window
 
 
+class Found(NamedTuple):
+    """A frontier as it is found in a window, its place in `map`.
+
+    opening: mostly for what may lie behind the edge of the unseen.
+    """
+
+    x_m: float
+    y_m: float
+    gain: float
+    opening: bool
+
+
 def least_gain(config: Config, ground_m2: float) -> float:
     """The gain from which a border is a frontier: a share of the ground known, within the two bounds, nats."""
     share = config.frontier_min_share * ground_m2 / config.spacing_m**2 * LOG_2
     return max(config.frontier_min_gain, min(share, config.frontier_enough_gain))
 
 
-def find_frontiers(
-    window: Window, config: Config, least: float | None = None
-) -> list[tuple[float, float, float]]:
-    """The frontiers of a window with at least this gain: (x, y, expected information gain), in a fixed order.
-
-    x, y: in `map`.
+def find_frontiers(window: Window, config: Config, least: float | None = None) -> list[Found]:
+    """The frontiers of a window with at least this gain, in a fixed order.
 
     The uncovered ground is split into connected pieces; the border of a piece with covered ground is cut into blocks
     snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Where the
@@ -34,6 +44,7 @@ def find_frontiers(
     s = window.spec
     labels = np.zeros(s.shape, np.int32)
     openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
+    openings &= near_robot(window, config.opening_range_m)
     open_ground = window.uncovered | openings
     pieces = label_components(open_ground, labels)
     if pieces == 0:
@@ -60,7 +71,17 @@ def find_frontiers(
     opening = hidden >= config.opening_min_m2 - 1e-9
     # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
     gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
-    return _select(gain, places, piece_of, window, least)
+    return _select(gain, opening, places, piece_of, window, least)
+
+
+def near_robot(window: Window, range_m: float) -> NDArray[np.bool_]:
+    """Cells within a distance of the robot's cell."""
+    rows = np.arange(window.spec.height) - window.robot_cell[0]
+    columns = np.arange(window.spec.width) - window.robot_cell[1]
+    near: NDArray[np.bool_] = (
+        rows[:, None] ** 2 + columns[None, :] ** 2 <= (range_m / window.spec.resolution_m) ** 2
+    )
+    return near
 
 
 def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -72,11 +93,12 @@ def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _select(
     gain: NDArray[np.float64],
+    opening: NDArray[np.bool_],
     places: NDArray[np.int64],
     piece_of: NDArray[np.int64],
     window: Window,
     least: float,
-) -> list[tuple[float, float, float]]:
+) -> list[Found]:
     """Blocks with enough gain; of a piece of many small blocks that is worth it as a whole, its best block."""
     found = []
     total = np.bincount(piece_of, weights=gain, minlength=int(piece_of.max()) + 1)
@@ -91,7 +113,7 @@ def _select(
         together = best[piece] == index and total[piece] >= least
         if places[index, 0] >= 0 and (alone or together):
             x, y = window.to_map(*window.spec.centre_of(int(places[index, 0]), int(places[index, 1])))
-            found.append((x, y, float(gain[index] if alone else total[piece])))
+            found.append(Found(x, y, float(gain[index] if alone else total[piece]), bool(opening[index])))
     return found
 
 

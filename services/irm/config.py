@@ -82,6 +82,12 @@ class Config(BaseModel):
         le=100,
         description="A border on so much unseen ground that the robot may enter is always a frontier, m2.",
     )
+    opening_range_m: float = Field(
+        7.0, gt=1, le=100, description="Such borders are looked for so near to the robot, m."
+    )
+    opening_rounds: int = Field(
+        3, ge=1, le=100, description="Seen in fewer rounds and gone again, such a border never was one."
+    )
     unknown_max_gain: float = Field(
         3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats."
     )
@@ -89,14 +95,18 @@ class Config(BaseModel):
     pursue_s: float = Field(
         90.0, gt=0, le=3600, description="A target that comes no nearer is given up then, s."
     )
-    patience_gain: float = Field(2.0, gt=0, le=100, description="A frontier worth so much, nats,")
-    patience: float = Field(5.0, ge=1, le=100, description="is waited for so many times longer.")
+    second_chance_gain: float = Field(
+        1.0,
+        gt=0,
+        le=1000,
+        description="A given-up frontier worth so much, nats, is tried once more when nothing else is left.",
+    )
     give_up_radius_m: float = Field(1.5, gt=0, le=10, description="How near that is, m.")
     retry_after_s: float = Field(
         600.0, gt=0, le=1e5, description="A given-up frontier may come back then, s."
     )
     blocked_memory_s: float = Field(
-        60.0, gt=0, le=1e4, description="Where the robot was blocked stays risky, s."
+        240.0, gt=0, le=1e4, description="Where the robot was blocked stays risky, s."
     )
 
     @model_validator(mode="after")

@@ -59,6 +59,7 @@ class FootprintStore:
         self._coverage = coverage
         self._footprints: dict[int, _Footprint] = {}
         self._blurred: set[int] = set()
+        self._changed: set[int] = set()
 
     def add(
         self,
@@ -90,6 +91,8 @@ class FootprintStore:
         new = np.zeros(held.spec.shape, dtype=np.bool_)
         new[common[0]] = seen[common[1]] & ~held.seen[common[0]]
         held.seen |= new
+        if new.any():
+            self._changed.add(scan.keyframe_id)
         self._add_evidence(*moved(held.spec, new, held.motion), held.evidence)
         return int(new.sum())
 
@@ -120,6 +123,7 @@ class FootprintStore:
                 continue
             self._add_evidence(*moved(held.spec, held.seen, held.motion), -held.evidence)
             held.placed = pose
+            self._changed.add(keyframe_id)
             self._add_evidence(*moved(held.spec, held.seen, held.motion), held.evidence)
             count += 1
         return count
@@ -145,25 +149,54 @@ class FootprintStore:
             held.blur = level
             self._add_evidence(spec, cells, held.evidence - before)
             (self._blurred.add if level else self._blurred.discard)(keyframe_id)
+            self._changed.add(keyframe_id)
             changed += 1
         return changed
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
-        return {
-            str(k): [list(f.pose), list(f.spec), np.packbits(f.seen), f.log_odds, list(f.placed), f.blur]
-            for k, f in sorted(self._footprints.items())
-        }
+        return {str(k): _pack(f) for k, f in sorted(self._footprints.items())}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """From a snapshot."""
-        self._footprints = {}
-        for key, (pose, spec_fields, packed, log_odds, placed, blur) in state.items():
-            spec = GridSpec(*spec_fields)
-            seen = np.unpackbits(packed, count=spec.width * spec.height).astype(np.bool_).reshape(spec.shape)
-            held = _Footprint(Planar(*pose), spec, seen, float(log_odds), Planar(*placed), blur)
-            self._footprints[int(key)] = held
+        """From a snapshot, with the coverage layer as it was then."""
+        self._footprints = {int(key): _unpack(packed) for key, packed in state.items()}
         self._blurred = {k for k, f in self._footprints.items() if f.blur}
+
+    def take_changes(self) -> dict[str, Any]:
+        """The footprints that have changed since the last call: for the journal."""
+        changed, self._changed = self._changed, set()
+        return {str(k): _pack(self._footprints[k]) for k in sorted(changed)}
+
+    def apply_changes(self, changes: dict[str, Any]) -> None:
+        """Take in changes from the journal: footprints and what they add to the coverage."""
+        for key, packed in changes.items():
+            new = _unpack(packed)
+            self._replace(self._footprints.get(int(key)), new)
+            self._footprints[int(key)] = new
+            (self._blurred.add if new.blur else self._blurred.discard)(int(key))
+
+    def _replace(self, old: _Footprint | None, new: _Footprint) -> None:
+        """Only the difference is counted when the keyframe has not moved: sums of evidence stay exact."""
+        fresh = new.seen.copy()
+        if old is not None and (old.placed, old.blur) == (new.placed, new.blur):
+            common = overlap(new.spec, old.spec)
+            assert common is not None  # footprints only grow
+            fresh[common[0]] &= ~old.seen[common[1]]
+        elif old is not None:
+            self._add_evidence(*moved(old.spec, old.seen, old.motion), -old.evidence)
+        self._add_evidence(*moved(new.spec, fresh, new.motion), new.evidence)
+
+
+def _pack(footprint: _Footprint) -> list[Any]:
+    f = footprint
+    return [list(f.pose), list(f.spec), np.packbits(f.seen), f.log_odds, list(f.placed), f.blur]
+
+
+def _unpack(packed: list[Any]) -> _Footprint:
+    pose, spec_fields, bits, log_odds, placed, blur = packed
+    spec = GridSpec(*spec_fields)
+    seen = np.unpackbits(bits, count=spec.width * spec.height).astype(np.bool_).reshape(spec.shape)
+    return _Footprint(Planar(*pose), spec, seen, float(log_odds), Planar(*placed), blur)
 
 
 def blur_level(deviation_m: float, from_m: float) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 from planning.frames import Planar
 from planning.grid import FREE, LETHAL, UNKNOWN
-from services.irm.borders import find_frontiers, least_gain
+from services.irm.borders import Found, find_frontiers, least_gain
 from services.irm.config import Config
 from services.irm.keyframes import NOBODY, Anchor
 from services.irm.spatial import SpatialHash
@@ -37,6 +37,9 @@ class Frontier:
     isolated: int = 0
     pursued_s: float = 0.0
     nearest_m: float = math.inf
+    again: bool = False
+    opening: bool = False
+    rounds: int = 0
     keyframe: int = NOBODY
     local_x_m: float = 0.0
     local_y_m: float = 0.0
@@ -44,13 +47,17 @@ class Frontier:
 
 @dataclass(slots=True)
 class GivenUp:
-    """A frontier that was given up, why, and when it may come back. Place and keyframe as there."""
+    """A frontier that was given up, why, when it may come back, and whether it has come back before.
+
+    Place and keyframe as there.
+    """
 
     x_m: float
     y_m: float
     gain: float
     reason: str
     until_ns: int
+    again: bool = False
     keyframe: int = NOBODY
     local_x_m: float = 0.0
     local_y_m: float = 0.0
@@ -85,6 +92,7 @@ class FrontierManager:
         robot: its place in `map`. elapsed_s: since the last call; ground_m2: known so far; anchor: the keyframe that
         the robot is at.
         """
+        next_id = self._second_chances(next_id)
         self.given_up = [g for g in self.given_up if g.until_ns > now_ns]
         least = least_gain(self.config, ground_m2)
         found = [f for f in find_frontiers(window, self.config, least) if not self._is_given_up(f[0], f[1])]
@@ -100,10 +108,10 @@ class FrontierManager:
             self._see_again(self.frontiers[node_id], found[index], anchor)
         for frontier in inside:
             if not frontier.seen:
-                self._miss(frontier, window, now_ns)
-        for index, (x, y, gain) in enumerate(found):
+                self._miss(frontier, window, robot, now_ns)
+        for index, (x, y, gain, opening) in enumerate(found):
             if index not in taken:
-                self._put(Frontier(next_id, x, y, gain), anchor)
+                self._put(Frontier(next_id, x, y, gain, opening=opening), anchor)
                 next_id += 1
         self._watch(window, robot, now_ns, elapsed_s)
         return next_id
@@ -138,15 +146,31 @@ class FrontierManager:
         """A frontier is there, or elsewhere than before, as seen from this keyframe."""
         frontier.keyframe = anchor.keyframe
         frontier.local_x_m, frontier.local_y_m = anchor.local(frontier.x_m, frontier.y_m)
+        self._keep(frontier)
+
+    def _keep(self, frontier: Frontier) -> None:
         self.frontiers[frontier.node_id] = frontier
         self._places.put(frontier.node_id, frontier.x_m, frontier.y_m)
         self._changed.add(frontier.node_id)
 
-    def _see_again(self, frontier: Frontier, found: tuple[float, float, float], anchor: Anchor) -> None:
-        if math.hypot(found[0] - frontier.x_m, found[1] - frontier.y_m) > 0.5:
+    def _second_chances(self, next_id: int) -> int:
+        """With nothing else left, frontiers with much to gain that were given up come back, once."""
+        if self.frontiers:
+            return next_id
+        for g in [g for g in self.given_up if g.gain >= self.config.second_chance_gain and not g.again]:
+            self.given_up.remove(g)
+            back = Frontier(next_id, g.x_m, g.y_m, g.gain, again=True, keyframe=g.keyframe)
+            back.local_x_m, back.local_y_m = g.local_x_m, g.local_y_m
+            self._keep(back)
+            next_id += 1
+        return next_id
+
+    def _see_again(self, frontier: Frontier, found: Found, anchor: Anchor) -> None:
+        if math.hypot(found.x_m - frontier.x_m, found.y_m - frontier.y_m) > 0.5:
             frontier.beside_s, frontier.pursued_s, frontier.nearest_m = 0.0, 0.0, math.inf
-        frontier.x_m, frontier.y_m, frontier.gain = found
+        frontier.x_m, frontier.y_m, frontier.gain, frontier.opening = found
         frontier.seen, frontier.missed = True, 0
+        frontier.rounds += 1
         self._put(frontier, anchor)
 
     def _forget(self, node_id: int) -> None:
@@ -166,7 +190,7 @@ class FrontierManager:
                 self.dropped += 1
                 self.dropped_gain += f.gain
 
-    def _miss(self, frontier: Frontier, window: Window, now_ns: int) -> None:
+    def _miss(self, frontier: Frontier, window: Window, robot: tuple[float, float], now_ns: int) -> None:
         """A frontier in the window that was not found again: covered, forgotten by the risk map, or cut off."""
         row, column = window.cell(frontier.x_m, frontier.y_m)
         if window.state[row, column] == UNKNOWN:
@@ -176,6 +200,13 @@ class FrontierManager:
             slice(max(0, row - reach), row + reach + 1),
             slice(max(0, column - reach), column + reach + 1),
         )
+        if frontier.opening and window.hopeful[near].any():
+            away_m = math.hypot(frontier.x_m - robot[0], frontier.y_m - robot[1])
+            if away_m > self.config.opening_range_m - 1.0:
+                return  # openings are looked for near the robot only
+        if frontier.opening and frontier.rounds < self.config.opening_rounds:
+            self._forget(frontier.node_id)
+            return
         looked = window.probability[near] >= self.config.covered_probability
         open_ground = (
             (window.state[near] != LETHAL) & ~looked & (window.ground[near] | (window.state[near] == FREE))
@@ -191,9 +222,9 @@ class FrontierManager:
                 self.give_up(frontier, "cut off: no way for the robot was found", now_ns)
 
     @staticmethod
-    def _pairs(found: list[tuple[float, float, float]], old: list[Frontier]) -> list[tuple[float, int, int]]:
+    def _pairs(found: list[Found], old: list[Frontier]) -> list[tuple[float, int, int]]:
         pairs = [
-            (math.hypot(x - f.x_m, y - f.y_m), i, f.node_id) for i, (x, y, _) in enumerate(found) for f in old
+            (math.hypot(x.x_m - f.x_m, x.y_m - f.y_m), i, f.node_id) for i, x in enumerate(found) for f in old
         ]
         return sorted(pairs)
 
@@ -209,12 +240,8 @@ class FrontierManager:
                 f.best_gain, f.beside_s, f.pursued_s = f.gain, 0.0, 0.0
             if math.hypot(f.x_m - robot[0], f.y_m - robot[1]) <= self.config.give_up_radius_m:
                 f.beside_s += elapsed_s
-            if f.beside_s > self.config.give_up_s * self._patience(f):
+            if f.beside_s > self.config.give_up_s:
                 self.give_up(f, "stood beside it and saw nothing new", now_ns)
-
-    def _patience(self, frontier: Frontier) -> float:
-        """Much to gain is not given up lightly: the mission would end with it uncovered."""
-        return 1.0 if frontier.gain < self.config.patience_gain else self.config.patience
 
     def progressed(self) -> None:
         """Ground was covered somewhere: the robot has better to do than to go to its target, which loses no time."""
@@ -232,7 +259,7 @@ class FrontierManager:
             return
         f.pursued_s += elapsed_s
         self._pursued.add(node_id)
-        if f.pursued_s > self.config.pursue_s * self._patience(f):
+        if f.pursued_s > self.config.pursue_s:
             self.give_up(f, "pursued in vain: the robot got no nearer", now_ns)
 
     def give_up(self, frontier: Frontier, reason: str, now_ns: int) -> None:
@@ -240,7 +267,7 @@ class FrontierManager:
         until = now_ns + int(self.config.retry_after_s * 1e9)
         f = frontier
         self.given_up.append(
-            GivenUp(f.x_m, f.y_m, f.gain, reason, until, f.keyframe, f.local_x_m, f.local_y_m)
+            GivenUp(f.x_m, f.y_m, f.gain, reason, until, f.again, f.keyframe, f.local_x_m, f.local_y_m)
         )
         self._forget(f.node_id)
 

@@ -191,7 +191,51 @@ class RoadGraph:
         return {
             "nodes": [[n, dict(d)] for n, d in sorted(self.graph.nodes(data=True))],
             "edges": sorted([min(a, b), max(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
+            "unpublished": self._unpublished(),
         }
+
+    def _unpublished(self) -> list[list[Any]]:
+        """What the last message said otherwise than the graph is now: [key, values], without values for what is new."""
+        before, found = self._published, []
+        for key in sorted(self._changed, key=lambda k: k if isinstance(k, tuple) else (k, -1)):
+            now = self._values(key) if self._exists(key) else None
+            if before and now != before.get(key):
+                found.append([key, list(before[key]) if key in before else None])
+        return found
+
+    def set_published(self, unpublished: list[list[Any]]) -> None:
+        """All that the graph holds was told in the last message, but for this (see `state`)."""
+        self._published = {k: self._values(k) for k in self._all_keys()}
+        self._changed = set()
+        for key, values in unpublished:
+            name = tuple(key) if isinstance(key, list) else key
+            self._changed.add(name)
+            if values is None:
+                del self._published[name]
+            else:
+                self._published[name] = tuple(values)
+
+    def difference(self, message: GlobalIrm) -> dict[str, Any]:
+        """What a message that was just made tells, with all that the graph keeps of it: for the journal."""
+        edges = zip(message.edge_a.tolist(), message.edge_b.tolist(), strict=True)
+        return {
+            "whole": message.base_version == 0,
+            "nodes": [[n, dict(self.graph.nodes[n])] for n in message.node_id.tolist()],
+            "edges": [[a, b, dict(self.graph.edges[a, b])] for a, b in edges],
+            "removed_nodes": message.removed_node.tolist(),
+            "removed_edges": message.removed_edge.tolist(),
+        }
+
+    def apply_difference(self, difference: dict[str, Any]) -> None:
+        """Take in a difference from the journal; the next message is whole."""
+        for a, b in difference["removed_edges"]:
+            if self.graph.has_edge(a, b):
+                self.drop_edge(a, b)
+        for node in difference["removed_nodes"]:
+            if node in self.graph:
+                self.drop_node(node)
+        self.add_state(difference)
+        self._published = {}
 
     def add_state(self, state: dict[str, Any]) -> None:
         """From a snapshot: nodes and edges are added or replaced."""

@@ -63,8 +63,10 @@ class GroundStore:
     def __init__(self, layer: TileLayer) -> None:
         self._layer = layer
         self._patches: dict[int, _Patch] = {}
-        self._current = Anchor()
+        self._current = NOBODY
         self._turn = 0
+        self._changed: set[int] = set()
+        self._written: GridSpec | None = None
 
     def write(self, spec: GridSpec, seen: NDArray[np.uint8], frame: Planar, anchor: Anchor) -> None:
         """Note what is seen now.
@@ -74,6 +76,7 @@ class GroundStore:
         """
         target, cells = moved(spec, seen, frame)
         self._paint(target, cells)
+        self._written = target if self._written is None else _around(self._written, target)
         if anchor.keyframe == NOBODY:
             return
         patch = self._patch(anchor, target)
@@ -88,12 +91,12 @@ class GroundStore:
     def _patch(self, anchor: Anchor, target: GridSpec) -> _Patch:
         """The patch to go on with: the one of before while its keyframe is near."""
         self._turn += 1
-        held = self._patches.get(self._current.keyframe)
+        held = self._patches.get(self._current)
         far = held is None or math.dist(held.placed[:2], anchor.pose[:2]) > _SPACING_M
         if far:
             if held is not None:
                 held.pack()
-            self._current = anchor
+            self._current = anchor.keyframe
             held = self._patches.get(anchor.keyframe)
             if held is None:
                 empty = np.zeros(target.shape, np.uint8)
@@ -101,6 +104,7 @@ class GroundStore:
             held.cells, held.bits = held.unpacked(), None
         assert held is not None
         held.turn = self._turn
+        self._changed.add(self._current)
         return held
 
     def _paint(self, target: GridSpec, cells: NDArray[np.uint8]) -> None:
@@ -114,6 +118,7 @@ class GroundStore:
             patch = self._patches[keyframe]
             tiles |= _tiles_of(bounds(patch.spec, patch.motion))
             patch.placed = keyframes[keyframe]
+            self._changed.add(keyframe)
             tiles |= _tiles_of(bounds(patch.spec, patch.motion))
         if tiles:
             self._compose(tiles)
@@ -139,36 +144,76 @@ class GroundStore:
 
     def state(self) -> dict[str, Any]:
         """For a snapshot; without the layer."""
-        patches = []
-        for keyframe, p in sorted(self._patches.items()):
-            bits = np.packbits([p.cells & 1, p.cells >> 1]) if p.bits is None else p.bits
-            patches.append([keyframe, list(p.pose), list(p.placed), list(p.spec), bits, p.turn])
-        return {"patches": patches, "current": self._current.keyframe, "turn": self._turn}
+        patches = [[k, *_pack(p)] for k, p in sorted(self._patches.items())]
+        return {"patches": patches, "current": self._current, "turn": self._turn}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """From a snapshot."""
-        none = np.zeros((0, 0), np.uint8)
-        self._patches = {
-            int(k): _Patch(Planar(*pose), Planar(*placed), GridSpec(*spec), none, int(turn), bits)
-            for k, pose, placed, spec, bits, turn in state["patches"]
+        """From a snapshot, with the layer as it was then."""
+        self._patches = {int(k): _unpack(*packed) for k, *packed in state["patches"]}
+        self._go_on(state)
+
+    def _go_on(self, state: dict[str, Any]) -> None:
+        self._current, self._turn = state["current"], state["turn"]
+        for keyframe, patch in self._patches.items():
+            if keyframe == self._current:
+                patch.cells, patch.bits = patch.unpacked(), None
+            else:
+                patch.pack()
+
+    def take_changes(self) -> dict[str, Any]:
+        """The patches that have grown or moved, and the layer where it was written since the last call: a record."""
+        changed, self._changed = self._changed, set()
+        written, self._written = self._written, None
+        return {
+            "patches": [[k, *_pack(self._patches[k])] for k in sorted(changed)],
+            "current": self._current,
+            "turn": self._turn,
+            "spec": None if written is None else list(written),
+            "layer": None if written is None else self._layer.read(written),
         }
-        self._turn = state["turn"]
-        held = self._patches.get(state["current"])
-        self._current = Anchor(state["current"], IDENTITY if held is None else held.placed)
-        if held is not None:
-            held.cells, held.bits = held.unpacked(), None
+
+    def apply_changes(self, changes: dict[str, Any]) -> None:
+        """Take in a record of the journal."""
+        tiles: set[tuple[int, int]] = set()
+        for k, *packed in changes["patches"]:
+            old, new = self._patches.get(int(k)), _unpack(*packed)
+            if old is not None and old.placed != new.placed:
+                tiles |= _tiles_of(bounds(old.spec, old.motion)) | _tiles_of(bounds(new.spec, new.motion))
+            self._patches[int(k)] = new
+        self._go_on(changes)
+        if tiles:
+            self._compose(tiles)
+        if changes["spec"] is not None:
+            self._layer.write(GridSpec(*changes["spec"]), changes["layer"])
+
+
+def _pack(patch: _Patch) -> list[Any]:
+    bits = np.packbits([patch.cells & 1, patch.cells >> 1]) if patch.bits is None else patch.bits
+    return [list(patch.pose), list(patch.placed), list(patch.spec), bits, patch.turn]
+
+
+def _unpack(
+    pose: list[float], placed: list[float], spec: list[Any], bits: NDArray[np.uint8], turn: int
+) -> _Patch:
+    none = np.zeros((0, 0), np.uint8)
+    return _Patch(Planar(*pose), Planar(*placed), GridSpec(*spec), none, turn, bits)
+
+
+def _around(a: GridSpec, b: GridSpec) -> GridSpec:
+    """The grid that holds both."""
+    ix0, iy0 = min(a.ix0, b.ix0), min(a.iy0, b.iy0)
+    width = max(a.ix0 + a.width, b.ix0 + b.width) - ix0
+    height = max(a.iy0 + a.height, b.iy0 + b.height) - iy0
+    return GridSpec(a.resolution_m, ix0, iy0, width, height)
 
 
 def _grow(patch: _Patch, target: GridSpec) -> None:
-    a = patch.spec
-    ix0, iy0 = min(a.ix0, target.ix0), min(a.iy0, target.iy0)
-    width = max(a.ix0 + a.width, target.ix0 + target.width) - ix0
-    height = max(a.iy0 + a.height, target.iy0 + target.height) - iy0
-    grown = GridSpec(a.resolution_m, ix0, iy0, width, height)
+    a, grown = patch.spec, _around(patch.spec, target)
     if grown == a:
         return
     cells = np.zeros(grown.shape, np.uint8)
-    cells[a.iy0 - iy0 : a.iy0 - iy0 + a.height, a.ix0 - ix0 : a.ix0 - ix0 + a.width] = patch.cells
+    row, column = a.iy0 - grown.iy0, a.ix0 - grown.ix0
+    cells[row : row + a.height, column : column + a.width] = patch.cells
     patch.spec, patch.cells = grown, cells
 
 

@@ -47,6 +47,7 @@ class Keyframes:
         self._id = np.empty(0, np.int64)
         self._pose = np.empty((0, 3))
         self._variance_m2 = np.empty(0)
+        self._changed: set[int] = set()
 
     def __len__(self) -> int:
         return self._id.size
@@ -67,6 +68,9 @@ class Keyframes:
         if new.size and moved[-1]:
             motion = _planar(after[-1]).compose(_planar(before[-1]).inverse())
         changed = {int(ids[k]): _planar(poses[k]) for k in new[moved]}
+        self._changed |= changed.keys()
+        if new.size < ids.size:
+            self._changed.update(np.delete(ids, new).tolist())
         self._id, self._pose = ids, poses
         self._variance_m2 = graph.covariance[:, :2].sum(axis=1)
         return changed, motion
@@ -115,6 +119,21 @@ class Keyframes:
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot."""
         self._id, self._pose, self._variance_m2 = state["id"], state["pose"], state["variance"]
+
+    def take_changes(self) -> dict[str, Any]:
+        """The keyframes that are new or have moved since the last call: for the journal."""
+        changed, self._changed = self._changed, set()
+        rows = [row for row in (self._row(k) for k in sorted(changed)) if row >= 0]
+        return {"id": self._id[rows], "pose": self._pose[rows], "variance": self._variance_m2[rows]}
+
+    def apply_changes(self, changes: dict[str, Any]) -> None:
+        """Take in changes from the journal."""
+        kept = ~np.isin(self._id, changes["id"])
+        ids = np.concatenate((self._id[kept], changes["id"]))
+        order = np.argsort(ids)
+        self._id = ids[order]
+        self._pose = np.concatenate((self._pose[kept], changes["pose"]))[order]
+        self._variance_m2 = np.concatenate((self._variance_m2[kept], changes["variance"]))[order]
 
 
 class OdomInMap:

@@ -283,15 +283,33 @@ class Roadmap:
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
+        return {**self.road.state(), **self._beside_graph()}
+
+    def _beside_graph(self) -> dict[str, Any]:
         return {
-            **self.road.state(),
             "manager": self.manager.state(),
             "counters": [self.next_id, self.version, self.last_breadcrumb],
         }
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """From a snapshot; the next message is whole."""
-        self.road = RoadGraph()
-        self.road.add_state(state)
+    def _set_beside_graph(self, state: dict[str, Any]) -> None:
         self.manager.set_state(state["manager"])
         self.next_id, self.version, self.last_breadcrumb = state["counters"]
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """From a snapshot."""
+        self.road = RoadGraph()
+        self.road.add_state(state)
+        self._set_beside_graph(state)
+        if self.version > 0:
+            self.road.set_published(state["unpublished"])
+
+    def difference(self, message: GlobalIrm) -> dict[str, Any]:
+        """What a message that was just made tells, with all that is kept of it: for the journal."""
+        return {**self.road.difference(message), **self._beside_graph()}
+
+    def apply_difference(self, difference: dict[str, Any]) -> None:
+        """Take in a difference from the journal; the next message is whole."""
+        if difference["whole"]:
+            self.road = RoadGraph()
+        self.road.apply_difference(difference)
+        self._set_beside_graph(difference)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import zlib
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +32,7 @@ from schemas.topics import (
     RISK_MAP,
     STATUS_GRAPH_REQUEST,
 )
-from schemas.world import CoverageSummary, CoverageWindow, GridHeader, RiskMap
+from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GridHeader, RiskMap
 from services.irm.areas import Areas
 from services.irm.config import Config
 from services.irm.footprints import FootprintStore
@@ -44,9 +46,13 @@ from services.irm.window import Window, build_window, grid_of, read_layer, windo
 
 __all__ = ["Config", "IrmStage", "create", "spec"]
 
+_BLOCKED_AGAIN_NS = 5 * SECOND_NS
+"""Blocked at one place again after so long, it counts once more."""
 _MAX_PENDING = 50
 _PROGRESS_M2 = 0.3
 _SAME_M = 1e-6
+_SKIPPED_VERSIONS = 1000
+"""More than the versions of the Local IRM that are given between two records."""
 
 
 def spec(config: Config) -> StageSpec:
@@ -79,6 +85,7 @@ class IrmStage:
         self._keyframes = Keyframes()
         self._odom = OdomInMap()
         self._moved = False
+        self._resumed = False
         self._pending: list[CoverageScan] = []
         self._penalties: list[tuple[int, float, float]] = []
         self._global_ns = -(10**18)
@@ -88,8 +95,14 @@ class IrmStage:
         """One round of Algorithm 1; nothing while the risk map or the pose is missing or stale."""
         self._pending += [r.message for r in inputs.new(COVERAGE_SCAN)]
         self._pending = self._pending[-_MAX_PENDING:]
-        self._read_pose_graph(inputs)
         risk, odometry = inputs.current(RISK_MAP), inputs.current(ODOMETRY)
+        if self._resumed and odometry is not None:
+            # Before anything is changed: readers hear that what was acknowledged still stands.
+            self._resumed = False
+            whole = self._roadmap.message(odometry.pose, self._frame_pose(odometry), now, True)
+            self._read_pose_graph(inputs)
+            return [Output(GLOBAL_IRM, whole)]
+        self._read_pose_graph(inputs)
         if risk is None or odometry is None:
             return []
         self._allocate(risk)
@@ -144,7 +157,8 @@ class IrmStage:
         if follower is None or not (follower.blocked or follower.stuck):
             return
         ahead = planar(odometry.pose).apply(0.5, 0.0)
-        if all(math.dist(ahead, p[1:]) > 0.3 for p in self._penalties):
+        lately = [p for p in self._penalties if now - p[0] < _BLOCKED_AGAIN_NS]
+        if all(math.dist(ahead, p[1:]) > 0.3 for p in lately):  # again and again: worse and worse
             self._penalties.append((now, *ahead))
 
     def _add_scans(self, risk: RiskMap, odometry: Odometry) -> None:
@@ -284,6 +298,51 @@ class IrmStage:
             self._store.set_state(state["footprints"])
             self._ground_store.set_state(state["patches"])
             self._local.set_state(state["anchors"])
+
+    def journal(self, outputs: Outputs) -> bytes:
+        """What the Global IRM and the coverage in `outputs` tell: the graph's difference, footprints and ground."""
+        assert self._ground_store and self._ground and self._store and self._local
+        record: dict[str, Any] = {
+            "graph": [
+                self._roadmap.difference(output.message)
+                for output in outputs
+                if isinstance(output.message, GlobalIrm)
+            ],
+            "footprints": self._store.take_changes(),
+            "ground": self._ground_store.take_changes(),
+            "keyframes": self._keyframes.take_changes(),
+            "odom": [*self._odom.state(), self._moved],
+            "resolution": self._ground.resolution_m,
+            "radius": self._local.footprint_radius_m,
+            "version": self._local.version,
+            "global_ns": self._global_ns,
+            "covered_m2": self._covered_m2,
+            "penalties": self._penalties,
+        }
+        return zlib.compress(pack_snapshot(record), 1)
+
+    def replay(self, record: bytes) -> None:
+        """Take in a record of the journal."""
+        state = unpack_snapshot(zlib.decompress(record))
+        if self._ground is None:
+            self._make_layers(state["resolution"], state["radius"], state["version"])
+        assert self._ground_store and self._store and self._local
+        for difference in state["graph"]:
+            self._roadmap.apply_difference(difference)
+        self._store.apply_changes(state["footprints"])
+        self._ground_store.apply_changes(state["ground"])
+        self._keyframes.apply_changes(state["keyframes"])
+        *odom, self._moved = state["odom"]
+        self._odom.set_state(odom)
+        self._local.version = state["version"]
+        self._global_ns, self._covered_m2 = state["global_ns"], state["covered_m2"]
+        self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
+
+    def resumed(self) -> None:
+        """Versions of the Local IRM that were given since the last record are not given again."""
+        self._resumed = self._roadmap.version > 0
+        if self._local is not None:
+            self._local.version += _SKIPPED_VERSIONS
 
 
 def _exploring(inputs: Inputs) -> bool:

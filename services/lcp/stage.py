@@ -16,7 +16,7 @@ from planning.reward import leftover_entropy, parameters
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
-from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.snapshot import pack_message, pack_snapshot, unpack_message, unpack_snapshot
 from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
 from schemas.world import LocalIrm
 from services.lcp.config import Config
@@ -209,15 +209,23 @@ class LcpStage:
         return _nothing(now, request, f"no way to target {policy.target} in the Local IRM")
 
     def snapshot(self) -> bytes:
-        """The phase and the last episode; Local IRMs come again."""
+        """The phase, the last episode, the Local IRMs that the next one may name, and what was promised; a search
+        begins anew."""
         return pack_snapshot(
-            {"covering": self._covering, "answered": self._answered, "promises": self._promises.state()}
+            {
+                "covering": self._covering,
+                "answered": self._answered,
+                "irms": [pack_message(irm) for irm in self._irms.values()],
+                "promises": self._promises.state(),
+            }
         )
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot."""
         state = unpack_snapshot(snapshot)
         self._covering, self._answered = bool(state["covering"]), int(state["answered"])
+        irms = [unpack_message(packed, LocalIrm) for packed in state["irms"]]
+        self._irms = OrderedDict((irm.irm_version, irm) for irm in irms)
         self._promises.set_state(state["promises"])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -168,9 +169,25 @@ class MissionStage:
 
     def snapshot(self) -> bytes:
         """Machine, graph, home, distance and what is left."""
-        state = {
+        return pack_snapshot({**self._beside_graph(), "graph": self._mirror.snapshot()})
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot."""
+        state = unpack_snapshot(snapshot)
+        self._mirror.restore(state["graph"])
+        self._set_beside_graph(state)
+
+    def journal(self, outputs: Outputs) -> bytes:
+        """All but the graph, which comes again from irm."""
+        return pack_snapshot(self._beside_graph())
+
+    def replay(self, record: bytes) -> None:
+        """Take in a record of the journal."""
+        self._set_beside_graph(unpack_snapshot(record))
+
+    def _beside_graph(self) -> dict[str, Any]:
+        return {
             "machine": self.machine.snapshot(),
-            "graph": self._mirror.snapshot(),
             "home": None if self._home is None else self._home.model_dump(),
             "at": None if self._at is None else self._at.model_dump(),
             "last_xy": self._last_xy,
@@ -179,13 +196,9 @@ class MissionStage:
             "asked_ns": self._asked_ns,
             "unreachable": [place.model_dump() for place in self._unreachable],
         }
-        return pack_snapshot(state)
 
-    def restore(self, snapshot: bytes) -> None:
-        """Go on from a snapshot."""
-        state = unpack_snapshot(snapshot)
+    def _set_beside_graph(self, state: dict[str, Any]) -> None:
         self.machine.restore(state["machine"])
-        self._mirror.restore(state["graph"])
         self._home = Pose(**state["home"]) if state["home"] else None
         self._at = Pose(**state["at"]) if state["at"] else None
         self._last_xy = (state["last_xy"][0], state["last_xy"][1]) if state["last_xy"] else None

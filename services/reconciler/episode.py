@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from planning.randomness import stream
 from planning.reward import leftover_entropy, parameters
 from planning.search import dijkstra_box, trace_path
 from schemas.sensing import Odometry
+from schemas.snapshot import pack_message, unpack_message
 from schemas.world import LocalIrm
 from services.reconciler.config import Config
 from services.reconciler.path import Ground, headings
@@ -54,6 +56,17 @@ class Opened:
     tau_s: float
     keeps_old: bool
     junction_point: int = 0
+
+
+def pack_opened(opened: Opened) -> dict[str, Any]:
+    """For a snapshot."""
+    state: dict[str, Any] = {f.name: getattr(opened, f.name) for f in fields(opened)}
+    return {**state, "irm": pack_message(opened.irm)}
+
+
+def unpack_opened(state: dict[str, Any]) -> Opened:
+    """From a snapshot."""
+    return Opened(**{**state, "irm": unpack_message(state["irm"], LocalIrm)})
 
 
 def heading_index(yaw_rad: float) -> int:

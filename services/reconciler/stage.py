@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,7 @@ from schemas.base import Message
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp, Topic
 from schemas.policy import EpisodeRequest, LocalPhase, LocalPolicy, Plan
 from schemas.sensing import FollowerState, Odometry
-from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.snapshot import pack_message, pack_snapshot, unpack_message, unpack_snapshot
 from schemas.topics import EPISODE, FOLLOWER, LOCAL_IRM, LOCAL_POLICY, MISSION, ODOMETRY, PLAN, RISK_MAP
 from schemas.world import LocalIrm
 from services.reconciler.config import Config
@@ -24,6 +26,8 @@ from services.reconciler.episode import (
     model_here,
     moves_between,
     node_index,
+    pack_opened,
+    unpack_opened,
     usable_nodes,
 )
 from services.reconciler.path import (
@@ -42,6 +46,13 @@ from services.reconciler.tau import choose_tau, tau_terms
 __all__ = ["Config", "ReconcilerStage", "create", "spec"]
 
 _NO_POINTS = np.zeros((0, 2))
+_KEPT = (
+    "at", "end", "episode", "opened_ns", "asked_ns", "plan_id", "published_ns", "changed", "slow", "why", "tau_s",
+    "kept_end", "trouble_ns", "value_ratio", "latency_s",
+)  # fmt: skip
+"""What a snapshot holds as it is."""
+_SKIPPED_IDS = 10_000
+"""More than the plans and episodes of the longest time between two snapshots."""
 _SOON_M = 2.5
 """With less of the path left than this a new episode opens at once."""
 
@@ -412,16 +423,32 @@ class ReconcilerStage:
         )
 
     def snapshot(self) -> bytes:
-        """Counters only: after a restart the robot plans anew from where it stands."""
+        """The policy that is driven, the open episode, the last plan and the counters."""
         return pack_snapshot(
-            {"episode": self._episode, "plan_id": self._plan_id, "value_ratio": self._value_ratio}
+            {
+                **{name: getattr(self, f"_{name}") for name in _KEPT},
+                "committed": None if self._committed is None else asdict(self._committed),
+                "opened": None if self._opened is None else pack_opened(self._opened),
+                "plan": None if self._plan is None else pack_message(self._plan),
+            }
         )
 
     def restore(self, snapshot: bytes) -> None:
-        """Go on from a snapshot; ids go on increasing."""
+        """Go on from a snapshot."""
         state = unpack_snapshot(snapshot)
-        self._episode, self._plan_id = int(state["episode"]), int(state["plan_id"]) + 1
-        self._value_ratio = float(state["value_ratio"])
+        for name in _KEPT:
+            setattr(self, f"_{name}", state[name])
+        self._committed = None if state["committed"] is None else Committed(**state["committed"])
+        self._opened = None if state["opened"] is None else unpack_opened(state["opened"])
+        self._plan = None if state["plan"] is None else unpack_message(state["plan"], Plan)
+
+    def resumed(self) -> None:
+        """The robot plans anew from where it stands. Ids that were given since the snapshot are not given again: the
+        follower would take a new plan for an old one."""
+        self._episode, self._plan_id = self._episode + _SKIPPED_IDS, self._plan_id + _SKIPPED_IDS
+        self._drop("resumed after a restart")
+        self._asked_ns = self._trouble_ns = -1
+        self._plan = None
 
 
 def looked_along(policy: LocalPolicy) -> NDArray[np.int64]:

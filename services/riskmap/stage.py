@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Any, Protocol
+
 import numpy as np
+from numpy.typing import NDArray
 
 from planning.grid import GridSpec
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
-from schemas.sensing import PointCloud
+from schemas.sensing import Odometry, PointCloud, ReadyGrid
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import CLOUD, ODOMETRY, READY_GRID, RISK_MAP
 from schemas.world import GridHeader, RiskMap
-from services.riskmap.collision import collision_layers
+from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
-from services.riskmap.occupancy import OccupancyWindow, integrate_sweep
-from services.riskmap.ready_grid import apply_ready_grid
+from services.riskmap.flat_model import FlatModel
+from services.riskmap.terrain_model import TerrainModel
 
 __all__ = ["Config", "RiskMapStage", "create", "spec", "warm_up"]
+
+_FUTURE_NS = SECOND_NS // 2
+"""A message stamped further ahead of the clock is wrong; taken, it would make every right one look old."""
 
 
 def spec(config: Config) -> StageSpec:
@@ -29,98 +35,166 @@ def create(config: Config, setup: StageSetup) -> Stage:
     return RiskMapStage(config)
 
 
+class Model(Protocol):
+    """A belief about the ground around the robot: the flat one or the terrain one."""
+
+    @property
+    def spec(self) -> GridSpec:
+        """Where the window lies."""
+        ...
+
+    def roll_to(self, x_m: float, y_m: float) -> bool:
+        """Centre the window on a point. Returns whether it moved."""
+        ...
+
+    def integrate(self, cloud: PointCloud) -> int:
+        """Add a sweep. Returns how many of its points were not finite."""
+        ...
+
+    def apply_grid(self, grid: ReadyGrid, robot: Pose, only_new: bool) -> None:
+        """Take over a ready grid; only_new: only where nothing is known yet."""
+        ...
+
+    def layers(self, robot: Pose) -> tuple[RiskLayers, NDArray[np.float32]]:
+        """The risk layers and the ground's height."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """For a snapshot."""
+        ...
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        ...
+
+
 class RiskMapStage:
-    """Integrates clouds as they come and publishes the risk map at its own period."""
+    """Integrates clouds as they come and publishes the risk map at its own period.
+
+    bad_points: points that were not finite. future_messages: clouds and grids dropped for their stamp.
+    """
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._window = OccupancyWindow(config.window_m, config.resolution_m)
+        self._model: Model = TerrainModel(config) if config.model == "terrain" else FlatModel(config)
         self._stamp_ns = -1
         self._published_ns = -(10**18)
         self._news = False
         self._pose = Pose()
+        self._grid: ReadyGrid | None = None
         self.bad_points = 0
+        self.future_messages = 0
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
-        """Read the newest cloud or grid; give the risk map when its period has passed and it has news."""
+        """Read the newest cloud or grid; give the risk map when its period has passed and it has news.
+
+        A ready grid that still counts is news in every period: it is all that there may be.
+        """
         odometry = inputs.latest(ODOMETRY)
         if odometry is not None:
             self._pose = odometry.message.pose
+        self._drop_old_grid(now)
         for received in inputs.new(CLOUD):
-            if received.age_ns <= self._config.cloud_timeout_s * SECOND_NS:
+            if received.age_ns <= self._config.cloud_timeout_s * SECOND_NS and self._timely(
+                now, received.message
+            ):
                 self._news |= self._integrate(received.message)
         for grid in inputs.new(READY_GRID):
-            self._window.roll_to(self._pose.x_m, self._pose.y_m)
-            apply_ready_grid(grid.message, self._window, self._config.clamp_log_odds)
-            self._stamp_ns = max(self._stamp_ns, grid.message.stamp_ns)
-            self._news = True
+            if self._timely(now, grid.message):
+                self._take_grid(grid.message)
+        standing = not self._news and self._grid is not None
         due = now - self._published_ns >= self._config.publish_period_s * SECOND_NS - SECOND_NS // 100
-        if not self._news or not due:
+        if not due or not (self._news or standing):
             return []
+        stamp_ns = max(self._stamp_ns, 0)
+        if standing:
+            self._roll_to(self._pose)
+            stamp_ns = max(stamp_ns, _stamp(odometry.message if odometry is not None else None, now))
         self._published_ns, self._news = now, False
-        return [Output(RISK_MAP, self._risk_map())]
+        return [Output(RISK_MAP, self._risk_map(stamp_ns))]
+
+    def _timely(self, now: Stamp, message: PointCloud | ReadyGrid) -> bool:
+        """Whether a message may be from now; counts it otherwise."""
+        if message.stamp_ns <= now + _FUTURE_NS:
+            return True
+        self.future_messages += 1
+        return False
+
+    def _drop_old_grid(self, now: Stamp) -> None:
+        timeout_ns = self._config.grid_timeout_s * SECOND_NS
+        if self._grid is not None and 0.0 < timeout_ns < now - self._grid.stamp_ns:
+            self._grid = None
+
+    def _take_grid(self, grid: ReadyGrid) -> None:
+        self._roll_to(self._pose)
+        self._grid = grid
+        self._model.apply_grid(grid, self._pose, only_new=False)
+        self._stamp_ns = max(self._stamp_ns, grid.stamp_ns)
+        self._news = True
+
+    def _roll_to(self, pose: Pose) -> None:
+        """Centre the window; the ground that enters it is looked up in the ready grid, if there is one."""
+        if self._model.roll_to(pose.x_m, pose.y_m) and self._grid is not None:
+            self._model.apply_grid(self._grid, self._pose, only_new=True)
 
     def _integrate(self, cloud: PointCloud) -> bool:
         if cloud.points_m.shape[0] == 0 or cloud.stamp_ns <= self._stamp_ns:
             return False
-        c, s = self._config, cloud.sensor_in_odom
-        self._window.roll_to(s.x_m, s.y_m)
-        w = self._window
-        heights = np.array([cloud.ground_z_m, c.ground_tolerance_m, c.robot_height_m, c.self_radius_m])
-        evidence = np.array([c.hit_log_odds, c.pass_log_odds, c.clamp_log_odds])
-        self.bad_points += integrate_sweep(
-            cloud.points_m, np.array([s.x_m, s.y_m, s.z_m, s.yaw_rad]), heights, evidence, w.spec.resolution_m,
-            w.spec.ix0, w.spec.iy0, w.log_odds, w.hit_weight, w.hit_x, w.hit_y,
-        )  # fmt: skip
+        self._roll_to(cloud.sensor_in_odom)
+        self.bad_points += self._model.integrate(cloud)
         self._stamp_ns = cloud.stamp_ns
         return True
 
-    def _risk_map(self) -> RiskMap:
-        c, w = self._config, self._window
-        layers = collision_layers(
-            w.log_odds, w.hit_x, w.hit_y, w.spec.resolution_m, c.free_log_odds, c.clamp_log_odds,
-            c.collision_hazard_per_m, c.cvar_alpha, c.max_clearance_m,
-        )  # fmt: skip
-        s = w.spec
+    def _risk_map(self, stamp_ns: int) -> RiskMap:
+        layers, elevation_m = self._model.layers(self._pose)
+        s = self._model.spec
         return RiskMap(
-            stamp_ns=max(self._stamp_ns, 0),
+            stamp_ns=stamp_ns,
             grid=GridHeader(
                 resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, width=s.width, height=s.height
             ),
             robot_pose=self._pose,
-            footprint_radius_m=c.footprint_radius_m,
-            elevation_m=np.zeros(s.shape, dtype=np.float32),
+            footprint_radius_m=self._config.footprint_radius_m,
+            elevation_m=elevation_m,
             **layers._asdict(),
         )
 
     def snapshot(self) -> bytes:
-        """The evidence window and the stamps."""
-        w = self._window
+        """The belief, the ready grid, and the stamps."""
         return pack_snapshot(
             {
-                "spec": list(w.spec),
-                "layers": [w.log_odds, w.hit_weight, w.hit_x, w.hit_y],
+                "model": self._model.state(),
                 "stamps": [self._stamp_ns, self._published_ns],
                 "news": self._news,
                 "pose": self._pose.model_dump(),
+                "grid": None if self._grid is None else self._grid.model_dump(),
             }
         )
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot."""
         state = unpack_snapshot(snapshot)
-        w = self._window
-        w.spec = GridSpec(*state["spec"])
-        w.log_odds, w.hit_weight, w.hit_x, w.hit_y = state["layers"]
+        self._model.load(state["model"])
         self._stamp_ns, self._published_ns = state["stamps"]
         self._news = bool(state["news"])
         self._pose = Pose(**state["pose"])
+        self._grid = None if state["grid"] is None else ReadyGrid(**state["grid"])
+
+
+def _stamp(odometry: Odometry | None, now: Stamp) -> Stamp:
+    """When the robot was where it is said to be: of its odometry, else now."""
+    return now if odometry is None else odometry.stamp_ns
 
 
 def warm_up() -> None:
-    """Compile the kernels."""
-    stage = RiskMapStage(Config())
-    points = np.array([[3.0, 0.5, -0.2], [5.0, 0.0, -0.8]], dtype=np.float32)
+    """Compile the kernels of both models."""
+    points = np.array([[3.0, 0.5, -0.2], [3.0, 0.0, -0.8], [3.6, 0.0, -0.8]], dtype=np.float32)
     cloud = PointCloud(stamp_ns=1, sensor_in_odom=Pose(z_m=0.8), range_m=20.0, points_m=points)
-    stage._integrate(cloud)
-    stage._risk_map()
+    grid = ReadyGrid(
+        stamp_ns=1, resolution_m=0.1, origin_x_m=0.0, origin_y_m=0.0, height=1, width=1,
+        occupancy=np.zeros((1, 1), dtype=np.int8),
+    )  # fmt: skip
+    for model in (FlatModel(Config(window_m=6.0)), TerrainModel(Config(model="terrain", window_m=6.0))):
+        model.integrate(cloud)
+        model.apply_grid(grid, Pose(), only_new=True)
+        model.layers(Pose())

@@ -79,7 +79,7 @@ class RobotConfig(_Model):
 
 
 class SlamConfig(_Model):
-    """What the simulated SLAM gives: a noisy pose and keyframes."""
+    """What the simulated SLAM gives: a noisy pose that drifts, keyframes, and loop closures (see `slam.Slam`)."""
 
     pose_noise_m: NotNegative = 0.01
     """Standard deviation of x and of y."""
@@ -87,6 +87,22 @@ class SlamConfig(_Model):
     """Standard deviation of the yaw."""
     keyframe_spacing_m: Positive = 1.0
     """A keyframe is added at this distance from the last one."""
+    drift_fraction: float = Field(default=0.0, ge=0.0, le=0.2)
+    """Error of dead reckoning as a share of the distance, rms, that of the yaw apart. 0: none."""
+    drift_yaw_deg_per_10m: float = Field(default=0.0, ge=0.0, le=20.0)
+    """Error of its yaw over 10 m, rms, in degrees. With both zero there is no drift, and no loop is closed."""
+    drift_correlation_m: float = Field(default=100.0, ge=1.0, le=1e5)
+    """Distance over which the drift stays alike: below it errors grow with the distance, beyond it with its root."""
+    closure_radius_m: float = Field(default=2.0, ge=0.0, le=20.0)
+    """So near to an old keyframe (true distance) a loop is closed. 0: never."""
+    closure_min_path_m: float = Field(default=30.0, ge=1.0, le=1e5)
+    """A keyframe is old when so much has been driven since."""
+    closure_interval_m: float = Field(default=5.0, ge=0.1, le=1e4)
+    """Distance driven between two loop closures, at least."""
+    closure_noise_m: NotNegative = 0.05
+    """Standard deviation of x and of y of the relative pose that a closure measures."""
+    closure_yaw_noise_rad: NotNegative = 0.005
+    """Standard deviation of its yaw."""
 
 
 class Start(_Model):

@@ -46,11 +46,15 @@ class Judge:
         self._cos_half_fov = math.cos(half_fov_rad) if sensor.fov_deg < 360.0 else -2.0
         self._reachable_cells = int(np.count_nonzero(self.reachable))
         self._covered_cells = 0
+        self._told = self.covered.copy()
+        self._box: tuple[float, float, float, float] | None = None
 
     def update(self, x_m: float, y_m: float, yaw_rad: float) -> int:
         """Look once from a true pose; returns how many cells are newly covered."""
         cell = self.spec.resolution_m
         x, y = x_m / cell - self.spec.ix0, y_m / cell - self.spec.iy0
+        low_x, low_y, high_x, high_y = self._box or (x, y, x, y)
+        self._box = (min(low_x, x), min(low_y, y), max(high_x, x), max(high_y, y))
         view = np.array([x, y, math.cos(yaw_rad), math.sin(yaw_rad)])
         new = look(self.occupied, self._pending, self.covered, view, self._range_cells, self._cos_half_fov)
         self._covered_cells += new
@@ -77,6 +81,25 @@ class Judge:
             raise ValueError(f"coverage mask of shape {covered.shape}, need {self.spec.shape}")
         self.covered = covered & self.reachable
         self._pending = self.reachable & ~self.covered
+        self._covered_cells = int(np.count_nonzero(self.covered))
+        self._told, self._box = self.covered.copy(), None
+
+    def take_news(self) -> NDArray[np.int64]:
+        """Flat indices of the cells covered since the last call: for the journal. Looks only where the robot was."""
+        if self._box is None:
+            return np.empty(0, np.int64)
+        low_x, low_y, high_x, high_y = self._box
+        self._box, reach = None, self._range_cells + 1.0
+        r0, c0 = max(0, math.floor(low_y - reach)), max(0, math.floor(low_x - reach))
+        near = (slice(r0, max(r0, math.ceil(high_y + reach))), slice(c0, max(c0, math.ceil(high_x + reach))))
+        rows, columns = np.nonzero(self.covered[near] & ~self._told[near])
+        self._told[near] = self.covered[near]
+        return (rows + r0) * self.spec.width + columns + c0
+
+    def add_covered(self, cells: NDArray[np.int64]) -> None:
+        """Take over cells that a twin has told of (from the journal). cells: flat indices."""
+        for mask, value in ((self.covered, True), (self._told, True), (self._pending, False)):
+            mask.reshape(-1)[cells] = value
         self._covered_cells = int(np.count_nonzero(self.covered))
 
 

@@ -1,15 +1,15 @@
 """The sim stage: drives the true robot along the plan and publishes what its sensors, SLAM and judge say.
 
-Version without drift: `map`, `odom` and the world's frame are one; SLAM's pose is the true one plus white noise.
+Without drift `map`, `odom` and the world's frame are one, and SLAM's pose is the true one plus white noise (`slam.py`).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from planning.frames import Planar
 from planning.grid import GridSpec
@@ -37,6 +37,7 @@ from services.sim.follower import Command, Follower, TimedPath
 from services.sim.follower import FollowerState as FollowerMemory
 from services.sim.lidar import Lidar
 from services.sim.robot import Robot, RobotState
+from services.sim.slam import Slam
 from services.sim.world import World, with_start
 from services.sim.worlds import build_world
 
@@ -52,7 +53,6 @@ _CONTROL_S = 0.05
 _POSE_GRAPH_NS, _JUDGE_NS, _PICTURE_NS = 2 * SECOND_NS, SECOND_NS // 2, 10 * SECOND_NS
 _PICTURE_CELLS = 1500
 """Most cells along a side of the world's picture."""
-_LEAST_VARIANCE = 1e-6
 _MOST_CERTAIN = 0.999
 """Detection probability is below 1 on the wire: the belief's log odds must stay finite."""
 _ENDED = (MissionPhase.DONE, MissionPhase.STOPPED)
@@ -82,7 +82,7 @@ class SimStage:
         self._plan = (0, 0, False)
         """plan_id, stamp and whether it can be driven, of the newest plan."""
         self._estimate = Planar(*world.start)
-        self._keyframes = np.empty((0, 3))
+        self._slam = Slam(config.slam, self._estimate, 0.0, stream(seed, "sim", "drift"))
         self._tick, self._last_ns = 0, -1
         self._distance_m = 0.0
         self._blocked, self._ended, self._told_lost = False, False, False
@@ -98,9 +98,9 @@ class SimStage:
         self._read_plan(now, inputs)
         self._estimate = self._noisy_pose(noise)
         self._command = self._follow(now / SECOND_NS)
-        added = self._add_keyframe()
+        changed = self._slam.update(stream(self._seed, "sim", "closure", self._tick))
         found = [Output(ODOMETRY, self._odometry(now)), Output(FOLLOWER, self._follower_state(now))]
-        if self._is_due("pose_graph", now, _POSE_GRAPH_NS) or added:
+        if self._is_due("pose_graph", now, _POSE_GRAPH_NS) or changed:
             found.append(Output(POSE_GRAPH, self._pose_graph(now)))
         if self._is_due("cloud", now, round(SECOND_NS / self._config.lidar.rate_hz)):
             found.append(Output(CLOUD, self._cloud(now)))
@@ -119,6 +119,7 @@ class SimStage:
         self._last_ns = now
         if elapsed_s <= 0.0:
             return
+        drift = stream(self._seed, "sim", "drift", self._tick)
         substeps = math.ceil(elapsed_s / _CONTROL_S - 1e-9)
         duration_s, began_s = elapsed_s / substeps, now / SECOND_NS - elapsed_s
         self._blocked = False
@@ -129,20 +130,15 @@ class SimStage:
             before = self._robot.state
             after = self._robot.step(self._command.speed_mps, self._command.turn_rate_radps, duration_s)
             self._distance_m += math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
+            self._slam.move(Planar(after.x_m, after.y_m, after.yaw_rad), 0.0, drift)
             self._blocked |= after.blocked
 
     def _follow(self, now_s: float) -> Command:
         return self._follower.step(*self._estimate, now_s, self._blocked)
 
     def _noisy_pose(self, noise: np.random.Generator) -> Planar:
-        """SLAM's pose of base_link in `odom`: the true one with white noise."""
-        slam, state = self._config.slam, self._robot.state
-        x, y, yaw = noise.standard_normal(3).tolist()
-        return Planar(
-            state.x_m + slam.pose_noise_m * x,
-            state.y_m + slam.pose_noise_m * y,
-            math.remainder(state.yaw_rad + slam.yaw_noise_rad * yaw, 2.0 * math.pi),
-        )
+        """SLAM's pose of base_link in `odom`, which the follower steers by."""
+        return self._slam.look(noise)
 
     def _read_plan(self, now: Stamp, inputs: Inputs) -> None:
         """Follow a new plan; the same one sent again only lives longer."""
@@ -185,21 +181,15 @@ class SimStage:
         """The estimated pose at a height."""
         return Pose(x_m=self._estimate.x_m, y_m=self._estimate.y_m, z_m=z_m, yaw_rad=self._estimate.yaw_rad)
 
-    def _variances(self) -> NDArray[np.float64]:
-        """Of x, y and yaw, shape (3,)."""
-        slam = self._config.slam
-        deviation = np.array([slam.pose_noise_m, slam.pose_noise_m, slam.yaw_noise_rad])
-        return np.maximum(deviation**2, _LEAST_VARIANCE)
-
     def _odometry(self, now: Stamp) -> Odometry:
-        state = self._robot.state
+        state, frame = self._robot.state, self._slam.map_to_odom
         return Odometry(
             stamp_ns=now,
             pose=self._pose(),
-            map_to_odom=Pose(),
+            map_to_odom=Pose(x_m=frame.x_m, y_m=frame.y_m, yaw_rad=frame.yaw_rad),
             speed_mps=state.speed_mps,
             turn_rate_radps=state.turn_rate_radps,
-            covariance=np.diag(self._variances()),
+            covariance=np.diag(self._slam.variances()),
         )
 
     def _follower_state(self, now: Stamp) -> FollowerState:
@@ -221,9 +211,7 @@ class SimStage:
         )
 
     def _coverage_scan(self, now: Stamp) -> CoverageScan:
-        offsets = self._keyframes[:, :2] - self._estimate[:2]
-        nearest = int(np.argmin(np.square(offsets).sum(axis=1)))
-        inside = Planar(*self._keyframes[nearest].tolist()).inverse().compose(self._estimate)
+        nearest, inside = self._slam.nearest()
         sensor = self._config.coverage_sensor
         return CoverageScan(
             stamp_ns=now,
@@ -235,26 +223,14 @@ class SimStage:
             detection_probability=min(sensor.detection_probability, _MOST_CERTAIN),
         )
 
-    def _add_keyframe(self) -> bool:
-        """Whether the robot has come far enough from the last keyframe for another."""
-        if self._keyframes.size:
-            last = self._keyframes[-1]
-            away_m = math.hypot(self._estimate.x_m - last[0], self._estimate.y_m - last[1])
-            if away_m < self._config.slam.keyframe_spacing_m:
-                return False
-        self._keyframes = np.vstack([self._keyframes, self._estimate])
-        return True
-
     def _pose_graph(self, now: Stamp) -> PoseGraph:
-        count = len(self._keyframes)
-        pose_in_map = np.zeros((count, 4))
-        pose_in_map[:, [0, 1, 3]] = self._keyframes
+        keyframes = self._slam.keyframes
         return PoseGraph(
             stamp_ns=now,
-            revision=0,
-            keyframe_id=np.arange(count),
-            pose_in_map=pose_in_map,
-            covariance=np.tile(self._variances(), (count, 1)),
+            revision=self._slam.revision,
+            keyframe_id=np.arange(len(keyframes)),
+            pose_in_map=keyframes,
+            covariance=self._slam.keyframe_variances(),
         )
 
     # --- the judge --------------------------------------------------------------------------------------------
@@ -293,24 +269,7 @@ class SimStage:
 
     def snapshot(self) -> bytes:
         """Robot, follower, judge, keyframes and counters; random streams need nothing but the tick."""
-        path = self._follower.path
-        return pack_snapshot(
-            {
-                "robot": list(self._robot.state),
-                "path": asdict(path) if path is not None else None,
-                "follower": asdict(self._follower.state),
-                "command": list(self._command),
-                "plan": list(self._plan),
-                "estimate": list(self._estimate),
-                "covered": np.packbits(self._judge.covered),
-                "keyframes": self._keyframes,
-                "clock": [self._tick, self._last_ns],
-                "distance_m": self._distance_m,
-                "flags": [self._blocked, self._ended, self._told_lost],
-                "slots": self._slots,
-                "bad_plans": self.bad_plans,
-            }
-        )
+        return pack_snapshot({**self._beside_judge(), "covered": np.packbits(self._judge.covered)})
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot of a stage with the same configuration and seed."""
@@ -318,6 +277,40 @@ class SimStage:
         cells = self._judge.spec.width * self._judge.spec.height
         covered = np.unpackbits(state["covered"], count=cells).astype(np.bool_)
         self._judge.set_covered(covered.reshape(self._judge.spec.shape))
+        self._set_beside_judge(state)
+
+    def journal(self, outputs: Outputs) -> bytes:
+        """All but the judge's cells, and of these the ones covered since the last record.
+
+        The world goes on from what was last judged or mapped (twice a second, and at each keyframe): the true robot
+        stands still from there on, and what was covered by the last report stays covered.
+        """
+        return pack_snapshot({**self._beside_judge(), "new": self._judge.take_news()})
+
+    def replay(self, record: bytes) -> None:
+        """Take in a record of the journal."""
+        state = unpack_snapshot(record)
+        self._judge.add_covered(state["new"])
+        self._set_beside_judge(state)
+
+    def _beside_judge(self) -> dict[str, Any]:
+        path = self._follower.path
+        return {
+            "robot": list(self._robot.state),
+            "path": asdict(path) if path is not None else None,
+            "follower": asdict(self._follower.state),
+            "command": list(self._command),
+            "plan": list(self._plan),
+            "estimate": list(self._estimate),
+            "slam": self._slam.state(),
+            "clock": [self._tick, self._last_ns],
+            "distance_m": self._distance_m,
+            "flags": [self._blocked, self._ended, self._told_lost],
+            "slots": self._slots,
+            "bad_plans": self.bad_plans,
+        }
+
+    def _set_beside_judge(self, state: dict[str, Any]) -> None:
         self._robot.state = RobotState(*state["robot"])
         self._follower.set_path(TimedPath(**state["path"]) if state["path"] is not None else None)
         memory = state["follower"]
@@ -329,7 +322,7 @@ class SimStage:
         plan_id, stamp_ns, driven = state["plan"]
         self._plan = (plan_id, stamp_ns, driven)
         self._estimate = Planar(*state["estimate"])
-        self._keyframes = state["keyframes"]
+        self._slam.set_state(state["slam"])
         self._tick, self._last_ns = state["clock"]
         self._distance_m = state["distance_m"]
         self._blocked, self._ended, self._told_lost = state["flags"]

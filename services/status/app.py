@@ -45,6 +45,16 @@ class SharedStatus:
         with self._lock:
             return self._core.graph_request(self._now_ns(), stamp_ns)
 
+    def snapshot(self) -> bytes:
+        """See `StatusCore.snapshot`."""
+        with self._lock:
+            return self._core.snapshot()
+
+    def restore(self, snapshot: bytes) -> None:
+        """See `StatusCore.restore`."""
+        with self._lock:
+            self._core.restore(snapshot)
+
     def status(self) -> StatusReport:
         """See `StatusCore.status`."""
         with self._lock:

@@ -47,6 +47,16 @@ class TileCanvas:
         inside = tile[y0 - ty * TILE : y1 - ty * TILE, x0 - tx * TILE : x1 - tx * TILE]
         np.copyto(inside, part.astype(np.uint8), where=part != 0)
 
+    def state(self) -> dict[str, Any]:
+        """For a snapshot."""
+        tiles = sorted(self._tiles.items())
+        return {"resolution_m": self.resolution_m, "tiles": [[tx, ty, tile] for (tx, ty), tile in tiles]}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """From a snapshot."""
+        self.resolution_m = state["resolution_m"]
+        self._tiles = {(tx, ty): tile for tx, ty, tile in state["tiles"]}
+
     def whole(self) -> tuple[GridSpec, Cells] | None:
         """Everything known, cut to its bounding box; None when nothing is."""
         if not self._tiles:

@@ -17,6 +17,7 @@ from schemas.contract import SECOND_NS
 from schemas.operation import JudgeReport, MissionState, StageHealth
 from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
+from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import health_topic, topic_named
 from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest
 from services.status.canvas import TileCanvas
@@ -265,6 +266,20 @@ class StatusCore:
         mission, coverage = self._mission(), self._coverage(None)
         phase = "no mission yet" if mission is None else f"{mission.phase} {mission.elapsed_s:.0f} s"
         return phase if coverage is None else f"{phase}, {100 * coverage.belief:.1f} % covered"
+
+    def snapshot(self) -> bytes:
+        """What messages will not tell again: the map, the trajectory, how often the target was switched."""
+        trajectory = np.array(self._trajectory, dtype=np.float64).reshape(-1, 2)
+        return pack_snapshot(
+            {"canvas": self.canvas.state(), "trajectory": trajectory, "target_switches": self.target_switches}
+        )
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot."""
+        state = unpack_snapshot(snapshot)
+        self.canvas.set_state(state["canvas"])
+        self._trajectory = [(float(x), float(y)) for x, y in state["trajectory"]]
+        self.target_switches = int(state["target_switches"])
 
     def numbers(self, now_ns: int) -> Mapping[str, float]:
         """The numbers of the status by name, for metrics; only what is known."""

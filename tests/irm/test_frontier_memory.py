@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from planning.coverage import LOG_2
 from planning.grid import FREE, LETHAL, UNKNOWN
 from schemas.snapshot import pack_snapshot, unpack_snapshot
-from services.irm.borders import beside, find_frontiers, least_gain
+from services.irm.borders import Found, beside, find_frontiers, least_gain
 from services.irm.config import Config
 from services.irm.frontiers import Frontier, FrontierManager
 from services.irm.window import Window, solid
@@ -26,7 +26,7 @@ class Scene:
     """A corridor of 16 x 3 m that the robot has covered up to some x, and its frontiers."""
 
     def __init__(self, covered_to_m: float = 99.0, **changes: float) -> None:
-        self.config = Config.model_validate(changes)
+        self.config = Config.model_validate({"opening_range_m": 12.0, **changes})
         self.belief, self.flat = Belief.new(self.config, RES), room(-8.0, 1.0, 8.0, 4.0, RES)
         self.manager, self.rounds, self.next_id = FrontierManager(self.config), 0, 1
         x, _ = np.meshgrid(self.flat.spec.centres_x(), self.flat.spec.centres_y())
@@ -35,7 +35,7 @@ class Scene:
     def window(self) -> Window:
         return self.belief.window(self.flat.risk_map(), *ROBOT)
 
-    def find(self) -> list[tuple[float, float, float]]:
+    def find(self) -> list[Found]:
         return find_frontiers(self.window(), self.config)
 
     def round(self, robot: tuple[float, float] = ROBOT, ground_m2: float = 0.0) -> dict[int, Frontier]:
@@ -88,7 +88,7 @@ def test_covered_ground_at_the_edge_of_the_unseen_is_a_frontier_and_beside_a_wal
     scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)  # the corridor's end was not seen: no wall
     found = scene.find()
     assert len(found) == 1
-    x, y, gain = found[0]
+    x, y, gain, _ = found[0]
     assert 3.0 < x < 4.0 and 1.0 < y < 4.0
     assert gain == pytest.approx(scene.config.unknown_max_gain), "more than 4 m2 may lie behind"
 
@@ -97,7 +97,7 @@ def test_covered_ground_at_the_edge_of_the_unseen_is_a_frontier_and_beside_a_wal
 def test_the_unseen_counts_up_to_a_limit_and_at_least_as_an_opening(most: float, gain: float) -> None:
     scene = Scene(unknown_max_gain=most, frontier_enough_gain=0.4)
     scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
-    assert [g for _, _, g in scene.find()] == [pytest.approx(gain)]
+    assert [g for _, _, g, _ in scene.find()] == [pytest.approx(gain)]
 
 
 @pytest.mark.parametrize(("width_m", "found"), [(0.2, 0), (0.4, 0), (0.8, 1), (1.2, 1)])
@@ -111,6 +111,39 @@ def test_an_opening_that_the_robot_fits_is_a_frontier_however_large_the_world(
     scene.flat.fill(4.0, 2.4, 4.2, 2.4 + width_m, FREE)
     scene.belief.cover(scene.flat.spec, scene.flat.state == FREE)
     assert len(scene.round(ground_m2=1e5)) == found
+
+
+def test_openings_are_looked_for_near_the_robot_and_kept_when_it_goes() -> None:
+    """Far walls seen at a slant are full of holes; an opening seen from near by is one."""
+    scene = Scene(opening_range_m=5.0)
+    scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
+    assert scene.find() == [], "10 m away"
+    near = scene.belief.window(scene.flat.risk_map(), 1.0, 2.5)
+    for k in range(3):
+        scene.next_id = scene.manager.update(near, (1.0, 2.5), k * SECOND, 1.0, scene.next_id)
+    name = scene.only().node_id
+    for _ in range(20):
+        scene.round()
+    assert scene.only().node_id == name
+    scene.flat.fill(4.0, 0.0, 9.0, 5.0, LETHAL)
+    for _ in range(20):
+        scene.round()
+    assert scene.manager.frontiers == {}, "it is seen from afar that there is none"
+
+
+def test_an_opening_that_was_seen_only_once_was_noise() -> None:
+    for rounds, kept in ((1, 0), (3, 1)):
+        scene = Scene(covered_to_m=-99.0, opening_rounds=3)
+        scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
+        looked = np.ones(scene.flat.spec.shape, np.bool_)
+        looked[scene.flat.spec.cell_of(3.7, 2.5)] = (
+            False  # a sliver: else it would be plain that nothing is left
+        )
+        scene.belief.cover(scene.flat.spec, looked)
+        for _ in range(rounds + 1):
+            scene.round()
+        scene.flat.fill(4.0, 1.0, 4.2, 4.0, LETHAL)
+        assert len(scene.round()) == kept
 
 
 def test_an_opening_out_of_sight_stays_a_frontier_when_the_known_ground_grows() -> None:
@@ -256,7 +289,7 @@ def test_time_beside_a_frontier_begins_anew_when_its_place_moves() -> None:
 
 
 def test_a_target_that_comes_no_nearer_is_given_up() -> None:
-    scene = Scene(covered_to_m=2.0, pursue_s=5.0, patience=1.0)
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0, second_chance_gain=99.0)
     scene.round()
     place = (scene.only().x_m, scene.only().y_m)
     scene.pursue(10.0)
@@ -273,19 +306,39 @@ def test_a_target_that_comes_no_nearer_is_given_up() -> None:
     assert all(math.dist(place, (f.x_m, f.y_m)) > 1.0 for f in scene.round().values())
 
 
-def test_a_target_with_much_to_gain_is_waited_for_longer() -> None:
-    scene = Scene(covered_to_m=2.0, pursue_s=5.0, patience_gain=0.2, patience=3.0)
+def test_much_to_gain_is_tried_once_more_when_nothing_else_is_left() -> None:
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0, second_chance_gain=0.2)
     scene.round()
-    for _ in range(16):
-        scene.pursue(10.0)
+    place = (scene.only().x_m, scene.only().y_m)
+    for chance in (False, True):
+        assert scene.only().again is chance
+        for _ in range(7):
+            if scene.manager.frontiers:
+                scene.pursue(10.0)
+        assert scene.manager.frontiers == {}
         scene.round()
-    assert len(scene.manager.frontiers) == 1
-    scene.pursue(10.0)
-    assert scene.manager.frontiers == {}
+    (given_up,) = scene.manager.given_up
+    assert (given_up.x_m, given_up.y_m) == place and given_up.again
+    assert scene.round() == {}, "not a third time"
+
+
+def test_no_second_chance_while_there_is_something_else_or_for_little() -> None:
+    for config, others in (({"second_chance_gain": 0.2}, True), ({"second_chance_gain": 99.0}, False)):
+        scene = Scene(covered_to_m=2.0, pursue_s=5.0, **config)
+        scene.round()
+        name = scene.only().node_id
+        for _ in range(7):
+            if name in scene.manager.frontiers:
+                scene.pursue(10.0)
+        if others:
+            scene.manager.frontiers[99] = Frontier(99, 500.0, 0.0, 9.0)
+        scene.round()
+        assert set(scene.manager.frontiers) == ({99} if others else set())
+        assert len(scene.manager.given_up) == 1
 
 
 def test_progress_elsewhere_takes_the_time_of_a_pursuit_back() -> None:
-    scene = Scene(covered_to_m=2.0, pursue_s=5.0, patience=1.0)
+    scene = Scene(covered_to_m=2.0, pursue_s=5.0)
     scene.round()
     for _ in range(5):
         for _ in range(4):

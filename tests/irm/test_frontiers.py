@@ -30,6 +30,7 @@ CONFIG = Config(
     frontier_min_gain=0.3,
     unknown_max_gain=1.5,
     opening_min_m2=0.6,
+    opening_range_m=7.0,
     frontier_enough_gain=0.7,
     spacing_m=1.0,
 )
@@ -72,7 +73,10 @@ def random_window(seed: int) -> Window:
 
 def open_of(window: Window) -> NDArray[np.bool_]:
     """Uncovered ground, and reachable ground at the edge of what may be entered unseen, by brute force."""
-    edge = window.reachable & (window.state == FREE) & _brute_edge(window)
+    rows, columns = np.indices(window.spec.shape)
+    away = np.hypot(rows - window.robot_cell[0], columns - window.robot_cell[1]) * window.spec.resolution_m
+    near = away <= CONFIG.opening_range_m
+    edge = near & window.reachable & (window.state == FREE) & _brute_edge(window)
     found: NDArray[np.bool_] = window.uncovered | edge
     return found
 
@@ -238,9 +242,9 @@ def test_every_piece_that_is_worth_it_has_a_frontier_and_no_gain_counts_twice(se
     window = random_window(seed)
     found = find_frontiers(window, CONFIG)
     block, gains, labels = _gains(window)
-    for x, y, _ in found:
+    for x, y, _, _ in found:
         assert window.reachable[window.spec.cell_of(x, y)]
-    assert sum(g for _, _, g in found) <= gains.sum() + 1e-6
+    assert sum(g for _, _, g, _ in found) <= gains.sum() + 1e-6
     alone = [g for g in gains if g >= CONFIG.frontier_min_gain]
     for piece in range(1, int(labels.max()) + 1):
         mine = np.unique(block[(labels == piece) & (block >= 0)])
@@ -250,8 +254,8 @@ def test_every_piece_that_is_worth_it_has_a_frontier_and_no_gain_counts_twice(se
             best = mine[int(np.argmax(gains[mine]))]
             if (window.reachable & (block == best)).any():
                 expected = gains[best] if gains[best] in alone else gains[mine].sum()
-                assert any(g == pytest.approx(expected, abs=1e-5) for _, _, g in found)
-    assert all(g >= CONFIG.frontier_min_gain - 1e-9 for _, _, g in found)
+                assert any(g == pytest.approx(expected, abs=1e-5) for _, _, g, _ in found)
+    assert all(g >= CONFIG.frontier_min_gain - 1e-9 for _, _, g, _ in found)
 
 
 @given(seed=st.integers(0, 3000), share=st.floats(0.1, 0.9))
@@ -272,10 +276,10 @@ def test_in_a_real_window_every_piece_of_open_ground_has_a_frontier(seed: int, s
             continue
         worth += 1
         cells = np.argwhere(pieces == piece) * 0.2 + np.array([flat.spec.iy0, flat.spec.ix0]) * 0.2 + 0.1
-        assert any(np.hypot(cells[:, 1] - fx, cells[:, 0] - fy).min() <= 0.3 for fx, fy, _ in found)
+        assert any(np.hypot(cells[:, 1] - fx, cells[:, 0] - fy).min() <= 0.3 for fx, fy, _, _ in found)
     assert len(found) >= worth
     most = float(window.entropy.sum(dtype=np.float64)) + config.unknown_max_gain * len(found)
-    assert sum(g for _, _, g in found) <= most + 1e-4
+    assert sum(g for _, _, g, _ in found) <= most + 1e-4
 
 
 def _manager(**changes: float) -> tuple[FrontierManager, Belief, Flat]:
@@ -327,7 +331,7 @@ def test_frontiers_outside_the_window_are_kept_as_they_were() -> None:
 
 
 def test_a_frontier_that_yields_nothing_is_given_up_and_comes_back_after_a_while() -> None:
-    manager, belief, flat = _manager(give_up_s=5.0, retry_after_s=30.0, patience=1.0)
+    manager, belief, flat = _manager(give_up_s=5.0, retry_after_s=30.0, second_chance_gain=99.0)
     _cover_up_to(belief, flat, 6.0)
     window = belief.window(flat.risk_map(), 0.0, 2.5)
     next_id = manager.update(window, (-7.0, 2.5), 0, 1.0, 1)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from planning.frames import Planar
-from planning.graph_mirror import GraphMirror
 from schemas.base import Message
 from schemas.codec import Envelope, decode, encode
 from schemas.contract import SECOND_NS, Inputs, Outputs, StageSetup, Topic
@@ -207,30 +206,16 @@ def drive(k: int) -> dict[str, Any]:
 
 @pytest.mark.parametrize("at", [1, 6, 9])
 def test_a_snapshot_goes_on_with_the_same_outputs(at: int) -> None:
-    """Byte for byte; only the first Global IRM is whole, and a reader holds the same graph after it."""
+    """Byte for byte, the differences of the Global IRM too."""
     flat = world()
     one_stage, other = create(CONFIG, StageSetup("husky1", 1)), create(CONFIG, StageSetup("husky1", 1))
-    mirrors = [GraphMirror(), GraphMirror()]
     for k in range(at):
-        graph = one(one_stage.step(k * HALF, feeds(flat, **drive(k))), GLOBAL_IRM)
-        if graph is not None:
-            assert mirrors[0].apply(graph)
+        one_stage.step(k * HALF, feeds(flat, **drive(k)))
     other.restore(one_stage.snapshot())
     assert other.snapshot() == one_stage.snapshot()
     for k in range(at, at + 6):
-        found = [s.step(k * HALF, feeds(flat, **drive(k))) for s in (one_stage, other)]
-        payloads = [wire(f) for f in found]
-        assert payloads[0].keys() == payloads[1].keys()
-        graphs = [one(f, GLOBAL_IRM) for f in found]
-        for mirror, graph in zip(mirrors, graphs, strict=True):
-            if graph is not None:
-                assert mirror.apply(graph)
-        if isinstance(graphs[1], GlobalIrm) and graphs[1].base_version == 0:
-            for payload in payloads:
-                del payload[GLOBAL_IRM.name]
-        assert payloads[0] == payloads[1]
-    pairs: list[tuple[Any, Any]] = list(zip(mirrors[0].road_map(), mirrors[1].road_map(), strict=True))
-    assert all(np.array_equal(a, b) for a, b in pairs)
+        found = [wire(s.step(k * HALF, feeds(flat, **drive(k)))) for s in (one_stage, other)]
+        assert found[0] == found[1]
 
 
 def test_an_empty_stage_goes_on_from_its_snapshot() -> None:
@@ -279,7 +264,7 @@ def test_the_frontier_that_the_global_planner_pursues_in_vain_is_given_up(
     offset: int, given_up: bool
 ) -> None:
     """The policy's target and distance count, by the time between rounds; a target that is no frontier is ignored."""
-    config = CONFIG.model_copy(update={"pursue_s": 5.0, "give_up_s": 600.0, "patience": 1.0})
+    config = CONFIG.model_copy(update={"pursue_s": 5.0, "give_up_s": 600.0, "second_chance_gain": 999.0})
     stage, flat = IrmStage(config), room(-4.0, -4.0, 4.0, 4.0, 0.2)
     names: list[int] = []
     reasons: list[list[str]] = []

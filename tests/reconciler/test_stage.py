@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from schemas.codec import Envelope, encode
-from schemas.contract import SECOND_NS, StageSetup
+from schemas.contract import SECOND_NS, Resuming, StageSetup
 from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, LocalPhase, Plan, SafetyState
 from schemas.snapshot import unpack_snapshot
@@ -424,11 +424,14 @@ def test_after_a_restart_ids_go_on_increasing() -> None:
     snapshot = rig.reconciler.stage.snapshot()
     stage = create(FEW, StageSetup("robot", 3))
     stage.restore(snapshot)
+    assert stage.snapshot() == snapshot
+    assert isinstance(stage, Resuming)
+    stage.resumed()
     rig.reconciler.stage = stage
     rig.answers.clear()
     rig.run(2.0)
-    assert all(plan.plan_id > last for plan in rig.plans if plan is rig.last())
-    assert rig.requests[asked].episode == asked + 1
+    assert all(plan.plan_id > last + 1000 for plan in rig.plans if plan is rig.last())
+    assert rig.requests[asked].episode > rig.requests[asked - 1].episode + 1000
     assert rig.last().valid
     assert math.hypot(rig.last().x_m[0] - rig.x_m, rig.last().y_m[0] - rig.y_m) < 0.1
 

@@ -21,8 +21,11 @@ TENTH = SECOND_NS // 10
 SETUP = StageSetup("husky1", 1)
 
 
-def stage() -> RiskMapStage:
-    return RiskMapStage(Config(window_m=12.0))
+def stage(model: str = "flat", **fields: float) -> RiskMapStage:
+    return RiskMapStage(Config.model_validate({"window_m": 12.0, "model": model, **fields}))
+
+
+both = pytest.mark.parametrize("model", ["flat", "terrain"])
 
 
 def step(
@@ -130,9 +133,11 @@ def test_the_map_rolls_with_the_robot_and_keeps_what_it_knew() -> None:
     assert all(state_at(message, 1.0, 1.0) == FREE for message in known)
 
 
+@both
 @pytest.mark.parametrize("news", [False, True])
-def test_a_snapshot_goes_on_with_the_same_bytes(news: bool) -> None:
-    one, other = stage(), create(Config(window_m=12.0), SETUP)
+def test_a_snapshot_goes_on_with_the_same_bytes(news: bool, model: str) -> None:
+    one, other = stage(model), create(Config.model_validate({"window_m": 12.0, "model": model}), SETUP)
+    one.step(0, inputs((READY_GRID, grid_of(np.zeros((16, 16), np.int8), 0))))
     for k in range(1, 5 + news):
         step(one, k * TENTH, 0.1 * k, 0.0)
     other.restore(one.snapshot())
@@ -167,11 +172,12 @@ def grid_of(occupancy: NDArray[np.int8], stamp_ns: int) -> ReadyGrid:
     )
 
 
-def test_a_ready_grid_alone_makes_a_risk_map() -> None:
+@both
+def test_a_ready_grid_alone_makes_a_risk_map(model: str) -> None:
     occupancy = np.zeros((16, 16), np.int8)
     occupancy[:, 12] = 100
     occupancy[0] = -1
-    room = stage()
+    room = stage(model)
     message = risk_map(room.step(TENTH, inputs((READY_GRID, grid_of(occupancy, 7)))))
     assert message.stamp_ns == 7
     assert state_at(message, 0.0, 0.0) == FREE
@@ -182,16 +188,87 @@ def test_a_ready_grid_alone_makes_a_risk_map() -> None:
 
 def test_a_cloud_older_than_a_ready_grid_is_ignored() -> None:
     room = stage()
-    room.step(TENTH, inputs((READY_GRID, grid_of(np.zeros((16, 16), np.int8), 5 * TENTH))))
-    assert step(room, 6 * TENTH, stamp_ns=4 * TENTH) == []
-    assert len(step(room, 7 * TENTH, stamp_ns=6 * TENTH)) == 1
+    room.step(5 * TENTH, inputs((READY_GRID, grid_of(np.zeros((16, 16), np.int8), 5 * TENTH))))
+    before = room._model.state()["layers"][0].copy()
+    step(room, 6 * TENTH, stamp_ns=4 * TENTH)
+    assert np.array_equal(room._model.state()["layers"][0], before)
+    step(room, 7 * TENTH, stamp_ns=6 * TENTH)
+    assert not np.array_equal(room._model.state()["layers"][0], before)
 
 
-def test_points_that_are_not_finite_are_counted_and_skipped() -> None:
+def large_grid(stamp_ns: int) -> ReadyGrid:
+    return ReadyGrid(
+        stamp_ns=stamp_ns, resolution_m=0.5, origin_x_m=-50.0, origin_y_m=-50.0, height=200, width=200,
+        occupancy=np.zeros((200, 200), np.int8),
+    )  # fmt: skip
+
+
+@both
+def test_a_mission_on_one_ready_grid_goes_on(model: str) -> None:
+    """The latched grid is there for what rolls in, and the map is published with the stamp of the odometry."""
+    room = stage(model)
+    room.step(0, inputs((READY_GRID, large_grid(0))))
+    for k in (2, 4, 300):
+        pose = odometry(0.3 * k / 10, 0.0, stamp_ns=k * TENTH - 1)
+        message = risk_map(room.step(k * TENTH, inputs((ODOMETRY, pose))))
+        assert message.stamp_ns == k * TENTH - 1
+        assert (message.state == FREE).all()
+    assert message.grid.ix0 == 30
+    wire(message)
+    assert risk_map(room.step(400 * TENTH, inputs())).stamp_ns == 400 * TENTH
+
+
+def test_a_ready_grid_may_grow_old() -> None:
+    room = stage(grid_timeout_s=2.0)
+    room.step(0, inputs((READY_GRID, large_grid(0))))
+    assert len(room.step(20 * TENTH, inputs())) == 1
+    assert room.step(23 * TENTH, inputs()) == []
+
+
+@both
+def test_messages_from_the_future_are_counted_and_block_nothing(model: str) -> None:
+    room = stage(model)
+    assert step(room, TENTH, stamp_ns=TENTH + SECOND_NS) == []
+    assert room.step(TENTH, inputs((READY_GRID, large_grid(TENTH + SECOND_NS)))) == []
+    assert room.future_messages == 2
+    assert len(step(room, 2 * TENTH)) == 1
+
+
+def test_the_terrain_model_makes_a_risk_map_of_a_room() -> None:
+    room = stage("terrain")
+    for k in range(1, 5):
+        step(room, k * TENTH)
+    message = risk_map(step(room, 5 * TENTH))
+    assert state_at(message, 2.0, 1.0) == FREE
+    assert state_at(message, 4.01, 0.01) == LETHAL
+    assert state_at(message, 5.0, 0.0) == UNKNOWN
+    assert message.elevation_m[message.state == FREE] == pytest.approx(0.0, abs=0.05)
+    wire(message)
+
+
+def test_two_runs_of_the_terrain_model_give_the_same_bytes() -> None:
+    found = []
+    for _ in range(2):
+        room = stage("terrain")
+        found.append([wire(risk_map(out)) for k in range(1, 6) if (out := step(room, k * TENTH, 0.1 * k))])
+    assert found[0] == found[1] and len(found[0]) == 3
+
+
+def test_the_profile_sets_the_defaults_and_fields_override_it() -> None:
+    husky = Config.model_validate({"profile": "husky", "max_step_m": 0.07})
+    assert (husky.footprint_radius_m, husky.max_slope_rad, husky.max_step_m) == (0.335, 0.42, 0.07)
+    assert Config() == Config(profile="spot")
+    assert (Config(risk_blind=True).alpha, Config().alpha) == (0.0, 0.9)
+    with pytest.raises(ValueError, match="profile"):
+        Config.model_validate({"profile": "tank"})
+
+
+@both
+def test_points_that_are_not_finite_are_counted_and_skipped(model: str) -> None:
     points = cloud(ROOM, 0, 0, TENTH).points_m.copy()
-    clean = stage()
+    clean = stage(model)
     clean._integrate(PointCloud(stamp_ns=TENTH, sensor_in_odom=Pose(z_m=0.8), range_m=20.0, points_m=points))
-    dirty = stage()
+    dirty = stage(model)
     message = PointCloud.model_construct(
         stamp_ns=TENTH,
         sensor_in_odom=Pose(z_m=0.8),

@@ -109,6 +109,18 @@ class FakeMission(_Memoryless):
         return [Output(MISSION, mission_state(now, self._seen, finish))]
 
 
+class Remembering(FakeMission):
+    """A mission that journals its count."""
+
+    def journal(self, outputs: Outputs) -> bytes:
+        """The count."""
+        return str(self._seen).encode()
+
+    def replay(self, record: bytes) -> None:
+        """The count of a record."""
+        self._seen = int(record)
+
+
 class Failing(_Memoryless):
     """Raises in every step."""
 
@@ -133,6 +145,8 @@ def make_fake(name: str, behaviour: str) -> tuple[StageSpec, Stage]:
         return StageSpec(name, SECOND_NS), Idle()
     if behaviour == "exits":
         sys.exit(1)
+    if behaviour == "remembers":
+        return StageSpec("mission", SECOND_NS, triggers=(ODOMETRY.name,)), Remembering(0)
     if name == "sim":
         return StageSpec("sim", SECOND_NS // 20), FakeSim()
     done_after = DONE_AFTER if behaviour == "ends" else 0

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -17,12 +19,13 @@ from plgrim.config import Config, load_config
 from plgrim.missions import run_lockstep
 from plgrim.runtime import lockstep
 from plgrim.runtime.health import ask_health
+from plgrim.runtime.router import page_address
 from plgrim.runtime.zenoh_session import Link
 from plgrim.warmup import warm_ups
 from schemas.contract import Stage, StageSpec
 from schemas.topics import TOPICS
 from tests.runtime.fake_services import make_fake
-from tests.runtime.helpers import FAKES, Start, eventually
+from tests.runtime.helpers import FAKES, REPOSITORY, Start, eventually
 
 
 def test_the_table_of_topics_names_every_topic() -> None:
@@ -155,3 +158,30 @@ def test_lock_step_writes_a_result_and_its_speed(tmp_path: Path, monkeypatch: py
 
 def test_stages_know_how_to_compile_their_kernels() -> None:
     assert {"riskmap", "gcp", "sim"} <= set(warm_ups())
+
+
+def test_a_reader_that_has_seen_enough_is_no_error() -> None:
+    """As in `plgrim status | head`."""
+    script = "from plgrim.commands.inspect import _print; _print('line\\n' * 200_000)"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=REPOSITORY
+    )
+    assert process.stdout is not None and process.stderr is not None
+    assert process.stdout.readline() == b"line\n"
+    process.stdout.close()
+    assert process.stderr.read() == b""
+    process.stderr.close()
+    assert process.wait() == 0
+
+
+@pytest.mark.parametrize(
+    ("host", "address"),
+    [
+        ("0.0.0.0", "http://127.0.0.1:8080/"),
+        ("::", "http://127.0.0.1:8080/"),
+        ("10.0.0.7", "http://10.0.0.7:8080/"),
+        ("::1", "http://[::1]:8080/"),
+    ],
+)
+def test_the_address_of_the_status_page_can_be_opened(host: str, address: str) -> None:
+    assert page_address(host, 8080) == address

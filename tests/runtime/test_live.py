@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from hypothesis import strategies as st
 from plgrim.config import Config
 from plgrim.errors import AlreadyRunningError
 from plgrim.runtime.health import ask_health, token_key
+from plgrim.runtime.journal import Journal
+from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.live import LiveDriver, next_due
 from plgrim.runtime.mailbox import Mailbox
 from plgrim.runtime.service import LiveService
@@ -23,7 +26,7 @@ from schemas.codec import Envelope, decode, encode
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, StageSpec, Stamp, Topic
 from schemas.operation import FinishReason, MissionState, StageHealth, WorldPicture
 from schemas.topics import MISSION, ODOMETRY, PLAN, WORLD_PICTURE, health_topic, read_by
-from tests.runtime.fake_services import FakeMission, mission_state, odometry
+from tests.runtime.fake_services import FakeMission, Remembering, mission_state, odometry
 from tests.runtime.helpers import FAKES, Start, eventually
 
 
@@ -244,6 +247,34 @@ def test_a_stage_cannot_write_what_belongs_to_another(config: Config, router: No
         assert service.monitor.errors == 1
         assert "mission may not write sim/odometry" in service.monitor.last_error
         assert PLAN.writer == "reconciler"
+
+
+def test_what_is_acknowledged_is_on_the_disk_before_it_is_said(
+    config: Config, router: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Read by another connection, as a restarted process would, at the very moment of publishing."""
+    on_disk: list[list[bytes]] = []
+
+    def publish(link: Link, topic: Topic[Message], payload: bytes) -> None:
+        del link, payload
+        if topic.name == MISSION.name:
+            on_disk.append([*Journal(tmp_path, "mission").recover()[0].records])
+
+    class Numbered(Remembering):
+        def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+            self._seen += 1
+            return super().step(now, inputs)
+
+    stage, stop = Numbered(0), threading.Event()
+    with LiveService("mission", config, stop) as service:
+        keeper = Keeper(Journal(tmp_path, "mission"), 5.0)
+        keeper.recover(lambda: stage, 0)
+        driver = LiveDriver(service, StageSpec("mission", SECOND_NS), stage, keeper)
+        monkeypatch.setattr(Link, "publish", publish)
+        for now in (1, 2, 3):
+            driver._step(now)
+        assert service.monitor.errors == 0
+    assert on_disk == [[b"1"], [b"1", b"2"], [b"1", b"2", b"3"]]
 
 
 @given(

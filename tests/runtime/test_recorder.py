@@ -64,8 +64,12 @@ def recorder() -> MissionRecorder:
         recorder.observe(JUDGE, _judge(distance, distance), distance * SECOND_NS)
     for switched in (True, False, True, True, True):
         recorder.observe(GLOBAL_POLICY, _policy(switched), 1)
-    for pid, errors, memory in ((1, 2, 10.0), (1, 3, 30.0), (2, 1, 20.0)):
-        recorder.observe(health_topic("gcp"), _health(pid, errors, memory), 1)
+    for epoch, errors, memory in (
+        (1, 2, 10.0),
+        (1, 3, 30.0),
+        (2, 1, 20.0),
+    ):  # in containers, all have process id 1
+        recorder.observe(health_topic("gcp"), _health(1, errors, memory), 1, epoch)
     for plan_id, (risk_s, sent_s) in enumerate([(1.0, 1.5), (1.0, 9.0), (2.0, 2.25), (3.0, 4.0)], 1):
         recorder.observe(PLAN, _plan(plan_id, risk_s), int(sent_s * SECOND_NS))
     return recorder

@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import threading
+from collections import Counter
 from pathlib import Path
 
 import psutil
@@ -18,7 +19,12 @@ from plgrim.errors import PortTakenError, ServiceFailedError
 from plgrim.missions import run_live
 from plgrim.runtime.process import THREAD_LIMITS, child_environment
 from plgrim.runtime.router import check_endpoint_free, host_and_port
-from plgrim.runtime.supervisor import Supervisor
+from plgrim.runtime.supervisor import Supervisor, with_fresh_state
+from schemas.base import Message
+from schemas.codec import decode
+from schemas.contract import Topic
+from schemas.operation import MissionState
+from schemas.topics import MISSION
 from tests.runtime.helpers import FAKES, Start, eventually, fake_command
 
 SERVICES = ("sim", "mission")
@@ -63,6 +69,70 @@ def test_a_killed_service_comes_back(config: Config, tmp_path: Path) -> None:
 
         eventually(is_back, "the service is ready again", supervisor.poll)
         assert sim.restarted == 1
+
+
+def _lives(heard: list[tuple[int, MissionState]]) -> int:
+    """The lives that have said more than one thing."""
+    counted = Counter(epoch for epoch, _ in list(heard))
+    return sum(count > 1 for count in counted.values())
+
+
+def test_a_killed_service_goes_on_with_what_it_had_said(config: Config, tmp_path: Path) -> None:
+    """It counts on; its mission clock goes on; its epoch is a later one, so that readers take what it says."""
+    heard: list[tuple[int, MissionState]] = []
+
+    def receive(topic: Topic[Message], payload: bytes) -> None:
+        message, envelope = decode(payload, topic.message, topic.max_bytes)
+        assert isinstance(message, MissionState)
+        heard.append((envelope.epoch, message))
+
+    with _supervisor(config, tmp_path, {"mission": "remembers"}) as supervisor:
+        link = supervisor.start()
+        link.subscribe(MISSION, receive, every=True)
+        supervisor.wait_ready(threading.Event())
+        mission = supervisor.children["mission"]
+        for life in range(3):
+            eventually(lambda: _lives(heard) > life, f"it counts in life {life}", supervisor.poll)  # noqa: B023
+            if life == 2:
+                break
+            killed = mission.process
+            assert killed is not None
+            os.kill(killed.pid, signal.SIGKILL)
+            eventually(lambda: mission.process is not killed, "it is noticed", supervisor.poll)  # noqa: B023
+        state = Path(supervisor.config.runtime.state_dir)
+        assert state == tmp_path / "state"
+        assert (state / "robot" / "mission.epoch").exists()
+    assert not state.exists()
+    ordered = sorted(heard, key=lambda item: (item[0], item[1].stamp_ns))
+    counts_heard = [message.distance_m for _, message in ordered]
+    assert counts_heard == sorted(counts_heard)
+    assert [m.stamp_ns for _, m in ordered] == sorted(m.stamp_ns for _, m in ordered)
+
+
+def test_what_ran_well_is_restarted_at_once_and_what_keeps_failing_waits_longer(
+    config: Config, tmp_path: Path
+) -> None:
+    supervisor = _supervisor(config, tmp_path)
+    child, now = supervisor.children["sim"], 1000.0
+    waits = []
+    for ready_for_s in (None, 1.0, None, 60.0, None):
+        child.ready_s = None if ready_for_s is None else now - ready_for_s
+        child.restarts.clear()
+        supervisor._ended(child, now)
+        assert child.restart_at_s is not None
+        waits.append(round((child.restart_at_s - now) / config.runtime.backoff_s, 6))
+    assert waits == [1, 2, 4, 0, 1]
+
+
+def test_each_run_begins_with_an_empty_state(config: Config, tmp_path: Path) -> None:
+    (tmp_path / "state").mkdir()
+    (tmp_path / "state" / "old").write_text("of the last mission", encoding="ascii")
+    own = with_fresh_state(config, tmp_path)
+    assert own.runtime.state_dir == str(tmp_path / "state")
+    assert not (tmp_path / "state" / "old").exists()
+    runtime = config.runtime.model_copy(update={"state_dir": str(tmp_path / "mine")})
+    named = with_fresh_state(config.model_copy(update={"runtime": runtime}), tmp_path)
+    assert Path(named.runtime.state_dir).parent == tmp_path / "mine"
 
 
 def test_a_killed_router_comes_back_and_the_services_find_it(config: Config, tmp_path: Path) -> None:

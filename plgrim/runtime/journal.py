@@ -1,0 +1,261 @@
+"""A service's journal: the newest snapshots of its state and what it has acknowledged since, on disk.
+
+Two SQLite files in WAL mode, written in turn. Each holds one generation: a snapshot, and the records that were appended
+after it. A snapshot begins the next generation in the other file, in one transaction, and thereby compacts: what that
+file held before goes. So there are always two generations that share no page: a damaged one costs nothing but the way
+back to the other, from which the records of both lead on. Records are numbered through; everything carries a checksum
+of its own, and reading stops at the first record that is missing or damaged: what is given back is a state that once
+was, never a mixture.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import xxhash
+
+from plgrim.errors import JournalError
+
+_FORMAT = 1
+_SLOTS = ("a", "b")
+_TABLES = (
+    "CREATE TABLE IF NOT EXISTS generation (number INTEGER PRIMARY KEY, first INTEGER NOT NULL, "
+    "saved_ns INTEGER NOT NULL, checksum BLOB NOT NULL, state BLOB NOT NULL)",
+    "CREATE TABLE IF NOT EXISTS record (number INTEGER PRIMARY KEY, checksum BLOB NOT NULL, content BLOB NOT NULL)",
+)
+_WAL_BYTES = 4 * 1024 * 1024
+_UNREADABLE = (sqlite3.Error, OSError, ValueError, TypeError, OverflowError, MemoryError, struct.error)
+"""What reading a damaged file may raise."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """A state that the service was in: a snapshot and the records after it, oldest first.
+
+    generation: number of the snapshot. first: number of the first record after it. saved_ns: mission clock of the
+    snapshot, ns.
+    """
+
+    generation: int
+    first: int
+    saved_ns: int
+    snapshot: bytes
+    records: tuple[bytes, ...]
+
+
+@dataclass(slots=True)
+class _Slot:
+    """What one file holds, as far as it is whole. snapshot None: its snapshot is damaged, its records may not be."""
+
+    number: int
+    first: int
+    saved_ns: int
+    snapshot: bytes | None
+    records: list[bytes] = field(default_factory=list)
+
+
+def _checksum(content: bytes, *numbers: int) -> bytes:
+    digest = xxhash.xxh3_64(struct.pack(f">{len(numbers)}q", *numbers))
+    digest.update(content)
+    return digest.digest()
+
+
+class Journal:
+    """The journal of one service in `folder`, which is made if need be. One process at a time writes it.
+
+    `recover` first, which reads; then `begin` with a snapshot; then `append` and `begin` as often as one likes. Each
+    returns when its content is on the disk. damage: what `recover` found wrong, for the log. Raises JournalError.
+    """
+
+    def __init__(self, folder: Path, service: str, durable: bool = True) -> None:
+        """durable: wait for the disk, so that a loss of power costs nothing either; not only the process's death."""
+        self.folder, self.service = folder, service
+        self._paths = tuple(folder / f"{service}.{slot}.sqlite" for slot in _SLOTS)
+        self._synchronous = "FULL" if durable else "NORMAL"
+        self._connections: list[sqlite3.Connection | None] = [None, None]
+        self._slot = 1
+        self._generation = 0
+        self._next = 1
+        self._writing = False
+        self.damage: list[str] = []
+        with _clear_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+
+    def recover(self) -> list[Recovered]:
+        """The states there are, the newest first: at most one from each file's snapshot. Empty without any.
+
+        The first is the one to go on from; the next is for when it cannot be restored.
+        """
+        slots = [self._read(index) for index in range(len(_SLOTS))]
+        found = sorted((s for s in slots if s is not None), key=lambda s: s.number, reverse=True)
+        states = []
+        for age, slot in enumerate(found):
+            if slot.snapshot is None:
+                continue
+            records = list(slot.records)
+            for newer in reversed(found[:age]):
+                if newer.first == slot.first + len(records):
+                    records += newer.records
+            states.append(Recovered(slot.number, slot.first, slot.saved_ns, slot.snapshot, tuple(records)))
+        if states:  # the generation that one goes on from must outlive the writing of the next
+            newest = states[0]
+            self._generation, self._next = newest.generation, newest.first + len(newest.records)
+            self._slot = next(
+                i for i, s in enumerate(slots) if s is not None and s.number == newest.generation
+            )
+        elif any(
+            path.exists() for path in self._paths
+        ):  # of no use, and not to be taken for newer ones later
+            with _clear_errors(self._paths[self._slot]):
+                self._discard(self._slot)
+        return states
+
+    def _read(self, index: int) -> _Slot | None:
+        path = self._paths[index]
+        if not path.exists():
+            return None
+        try:
+            with contextlib.closing(self._connect(path)) as connection:
+                return self._read_slot(connection, path.name)
+        except _UNREADABLE as error:
+            self.damage.append(f"{path.name}: {error}")
+            return None
+
+    def _read_slot(self, connection: sqlite3.Connection, name: str) -> _Slot | None:
+        if connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'record'").fetchone() is None:
+            return None  # the process ended before anything was in it
+        head = connection.execute("SELECT number, first, saved_ns, checksum FROM generation").fetchone()
+        if head is None:
+            return None
+        number, first, saved_ns, checksum = head
+        if not all(isinstance(value, int) for value in (number, first, saved_ns)):
+            raise ValueError("the generation's numbers are damaged")
+        slot = _Slot(number, first, saved_ns, None)
+        try:
+            (state,) = connection.execute("SELECT state FROM generation").fetchone()
+            if _checksum(state, number, first, saved_ns) == checksum:
+                slot.snapshot = bytes(state)
+            else:
+                self.damage.append(f"{name}: the snapshot's checksum does not match")
+        except _UNREADABLE as error:
+            self.damage.append(f"{name}: the snapshot cannot be read: {error}")
+        self._read_records(connection, slot, name)
+        return slot
+
+    def _read_records(self, connection: sqlite3.Connection, slot: _Slot, name: str) -> None:
+        """The records in order, up to the first that is missing or damaged."""
+        query = "SELECT number, checksum, content FROM record ORDER BY number"
+        try:
+            for number, checksum, content in connection.execute(query):
+                expected = slot.first + len(slot.records)
+                if number != expected or _checksum(content, number) != checksum:
+                    self.damage.append(
+                        f"{name}: record {expected} is damaged or missing: the rest is not used"
+                    )
+                    return
+                slot.records.append(bytes(content))
+        except _UNREADABLE as error:
+            self.damage.append(f"{name}: {len(slot.records)} records, then: {error}")
+
+    def _connect(self, path: Path) -> sqlite3.Connection:
+        connection = sqlite3.connect(path, isolation_level=None, timeout=5.0)
+        try:
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute(f"PRAGMA synchronous = {self._synchronous}")
+            connection.execute(f"PRAGMA journal_size_limit = {_WAL_BYTES}")
+            (found,) = connection.execute("PRAGMA user_version").fetchone()
+            if found not in (0, _FORMAT):
+                raise sqlite3.DatabaseError(f"format {found}, this program writes {_FORMAT}")
+        except BaseException:
+            connection.close()
+            raise
+        return connection
+
+    def begin(self, snapshot: bytes, now_ns: int) -> None:
+        """Begin the next generation with a snapshot. now_ns: mission clock, ns. Raises JournalError."""
+        target = 1 - self._slot
+        number = self._generation + 1
+        row = (number, self._next, now_ns, _checksum(snapshot, number, self._next, now_ns), snapshot)
+        with _clear_errors(self._paths[target]):
+            try:
+                self._replace(target, row)
+            except sqlite3.Error:  # damaged, or no space: it holds nothing that is still needed
+                self._discard(target)
+                self._replace(target, row)
+        self._slot, self._generation, self._writing = target, number, True
+
+    def _replace(self, index: int, row: tuple[int, int, int, bytes, bytes]) -> None:
+        connection = self._writable(index)
+        with _transaction(connection):
+            connection.execute("DELETE FROM generation")
+            connection.execute("DELETE FROM record")
+            connection.execute("INSERT INTO generation VALUES (?, ?, ?, ?, ?)", row)
+
+    def _writable(self, index: int) -> sqlite3.Connection:
+        held = self._connections[index]
+        if held is None:
+            held = self._connect(self._paths[index])
+            self._connections[index] = held
+            with _transaction(held):
+                for table in _TABLES:
+                    held.execute(table)
+                held.execute(f"PRAGMA user_version = {_FORMAT}")
+        return held
+
+    def _discard(self, index: int) -> None:
+        """Remove a file that SQLite cannot use, with its log."""
+        self._close(index)
+        path = self._paths[index]
+        for suffix in ("", "-wal", "-shm"):
+            path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+    def append(self, content: bytes) -> None:
+        """Add one record. It is on the disk when this returns. Raises JournalError; then begin anew."""
+        if not self._writing:
+            raise JournalError("a journal begins with a snapshot")
+        with _clear_errors(self._paths[self._slot]):
+            connection = self._writable(self._slot)
+            with _transaction(connection):
+                connection.execute(
+                    "INSERT INTO record VALUES (?, ?, ?)",
+                    (self._next, _checksum(content, self._next), content),
+                )
+        self._next += 1
+
+    def close(self) -> None:
+        """Close the files."""
+        self._writing = False
+        for index in range(len(_SLOTS)):
+            self._close(index)
+
+    def _close(self, index: int) -> None:
+        connection, self._connections[index] = self._connections[index], None
+        if connection is not None:
+            with contextlib.suppress(sqlite3.Error):
+                connection.close()
+
+
+@contextlib.contextmanager
+def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        with contextlib.suppress(sqlite3.Error):
+            connection.execute("ROLLBACK")
+        raise
+
+
+@contextlib.contextmanager
+def _clear_errors(path: Path) -> Iterator[None]:
+    """Errors of SQLite and of the file system become a JournalError that names the file."""
+    try:
+        yield
+    except (sqlite3.Error, OSError) as error:
+        raise JournalError(f"{path}: the journal cannot be written: {error}") from error

@@ -1,0 +1,199 @@
+"""Keeps a stage's state over the death of its process: recovers it at the start, journals it while it runs.
+
+The order is what makes it safe: a step, its record on the disk, and only then its outputs on the wire. Snapshots are
+taken between steps, never inside one.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from plgrim.config import RuntimeConfig
+from plgrim.errors import JournalError
+from plgrim.logs import get_logger
+from plgrim.runtime.journal import Journal, Recovered
+from schemas.contract import SECOND_NS, Journaling, Outputs, Resuming, Stamp
+
+_LARGEST_SHARE = 0.02
+"""Of the time that snapshots may take: expensive ones are taken less often, and the records bridge the longer gap."""
+_NOT_DURABLE = frozenset({"sim"})
+"""The simulated world dies with its host: its journal need not wait for the disk, 4 times a second."""
+_TRIES = 3
+"""A state from which so many lives in a row did not get through their first steps is not restored once more."""
+_GOOD_STEPS = 3
+
+
+class Restorable(Protocol):
+    """What a keeper keeps: a stage, or anything else with its two methods."""
+
+    def snapshot(self) -> bytes:
+        """Everything that is needed to go on."""
+        ...
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from a snapshot."""
+        ...
+
+
+_R = TypeVar("_R", bound=Restorable)
+
+
+class Keeper:
+    """The journal of one service, and when it is written. Used by the thread that steps the stage.
+
+    trouble: why nothing is journaled now; empty while all is well. A service goes on without its journal (a full disk
+    must not stop a robot), says so, and tries again with the next snapshot.
+    """
+
+    def __init__(
+        self, journal: Journal, period_s: float, stopwatch: Callable[[], float] = time.monotonic
+    ) -> None:
+        """period_s: wall time between snapshots. stopwatch: wall seconds."""
+        self._journal = journal
+        self._period_s = period_s
+        self._stopwatch = stopwatch
+        self._due_s = 0.0
+        self._tries = journal.folder / f"{journal.service}.tries"
+        self._steps_to_go = 0
+        self.trouble = ""
+        self.recovered = False
+        self._log = get_logger()
+
+    @classmethod
+    def of(cls, config: RuntimeConfig, robot: str, service: str) -> Keeper | None:
+        """The keeper of a service, or None when no `state_dir` is configured. Raises JournalError."""
+        if not config.state_dir:
+            return None
+        journal = Journal(Path(config.state_dir) / robot, service, service not in _NOT_DURABLE)
+        return cls(journal, config.snapshot_period_s)
+
+    def recover(self, make: Callable[[], _R], now: Stamp) -> _R:
+        """A stage as it was when its process died; as new when there is nothing to go on from.
+
+        make: gives a new stage; called again when a state cannot be restored. now: mission clock. Raises JournalError
+        and what `make` raises.
+        """
+        stage = make()
+        states = self._journal.recover()
+        for damage in self._journal.damage:
+            self._log.error("journal damaged", what=damage)
+        tries = _read_number(self._tries)
+        for state in states:
+            if tries >= _TRIES:
+                self._log.error("the state is not used: no life that began with it went on", tries=tries)
+                break
+            if state.saved_ns > now:
+                self._log.warning("journal of another mission: not used", saved_s=state.saved_ns / SECOND_NS)
+                continue
+            if self._restore(stage, state):
+                self.recovered = True
+                break
+            stage = make()
+        if self.recovered:
+            self._steps_to_go = _GOOD_STEPS
+            _write_number(self._tries, tries + 1)
+            _tell(stage)
+        self._begin(stage, now)
+        if self.trouble:
+            raise JournalError(self.trouble)
+        return stage
+
+    def _restore(self, stage: Restorable, state: Recovered) -> bool:
+        began = self._stopwatch()
+        try:
+            stage.restore(state.snapshot)
+            if isinstance(stage, Journaling):
+                for record in state.records:
+                    stage.replay(record)
+        except Exception as error:  # of another version of the program, or of another configuration
+            self._log.error("state cannot be restored", generation=state.generation, exc_info=error)
+            return False
+        self._log.info(
+            "resumed",
+            generation=state.generation,
+            records=len(state.records),
+            kib=len(state.snapshot) // 1024,
+            took_ms=round(1e3 * (self._stopwatch() - began), 1),
+        )
+        return True
+
+    def before_publishing(self, stage: Restorable, outputs: Outputs) -> None:
+        """Write what the outputs acknowledge; call it after a step and before any of them is published."""
+        if self.trouble or not isinstance(stage, Journaling):
+            return
+        if any(output.topic.journaled for output in outputs):
+            record = stage.journal(outputs)
+            self._write(lambda: self._journal.append(record))
+
+    def after_step(self, stage: Restorable, now: Stamp) -> None:
+        """Take a snapshot when it is time. Call it between steps that went well."""
+        if self._steps_to_go:
+            self._steps_to_go -= 1
+            if not self._steps_to_go:
+                self._tries.unlink(missing_ok=True)
+        if self._stopwatch() >= self._due_s:
+            self._begin(stage, now)
+
+    def _begin(self, stage: Restorable, now: Stamp) -> None:
+        began = self._stopwatch()
+        snapshot = stage.snapshot()
+        self._write(lambda: self._journal.begin(snapshot, now))
+        ended = self._stopwatch()
+        self._due_s = ended + max(self._period_s, (ended - began) / _LARGEST_SHARE)
+
+    def _write(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+        except JournalError as error:
+            if not self.trouble:
+                self._log.error("nothing is journaled", reason=str(error))
+            self.trouble = str(error)
+        else:
+            self.trouble = ""
+
+    def close(self, stage: Restorable | None = None, now: Stamp = 0) -> None:
+        """Close the journal, with a last snapshot of a stage that ends in order."""
+        if stage is not None:
+            self._begin(stage, now)
+        self._journal.close()
+
+
+def _tell(stage: object) -> None:
+    if isinstance(stage, Resuming):
+        stage.resumed()
+
+
+def next_epoch(config: RuntimeConfig, robot: str, service: str, now_ms: int) -> int:
+    """The epoch of a service's new life: the wall clock, ms, but always later than its last one.
+
+    Readers refuse what comes from an epoch that is over: a wall clock that was set back must not silence a service.
+    """
+    if not config.state_dir:
+        return now_ms
+    path = Path(config.state_dir) / robot / f"{service}.epoch"
+    epoch = max(now_ms, _read_number(path) + 1)
+    _write_number(path, epoch)
+    return epoch
+
+
+def _read_number(path: Path) -> int:
+    """The number in a small file; 0 when there is none."""
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return 0
+
+
+def _write_number(path: Path, number: int) -> None:
+    """Write a small file whole or not at all; a failure is logged, for nothing hangs on it alone."""
+    fresh = path.with_suffix(f"{path.suffix}.{os.getpid()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh.write_text(str(number), encoding="ascii")
+        fresh.replace(path)
+    except OSError as error:
+        get_logger().warning("not written", file=str(path), error=str(error))

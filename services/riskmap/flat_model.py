@@ -1,0 +1,71 @@
+"""Flat ground: obstacles alone, from sweeps swept at body height."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.grid import GridSpec
+from schemas.base import Pose
+from schemas.sensing import PointCloud, ReadyGrid
+from services.riskmap.collision import RiskLayers, collision_layers
+from services.riskmap.config import Config
+from services.riskmap.extrinsics import body_box, transform, without_body
+from services.riskmap.occupancy import OccupancyWindow, integrate_sweep
+from services.riskmap.ready_grid import apply_ready_grid
+
+
+class FlatModel:
+    """Log-odds of obstacles in a rolling window (see `occupancy`)."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._window = OccupancyWindow(config.window_m, config.resolution_m)
+
+    @property
+    def spec(self) -> GridSpec:
+        """Where the window lies."""
+        return self._window.spec
+
+    def roll_to(self, x_m: float, y_m: float) -> bool:
+        """Centre the window on a point. Returns whether it moved."""
+        before = self._window.spec
+        self._window.roll_to(x_m, y_m)
+        return self._window.spec != before
+
+    def integrate(self, cloud: PointCloud) -> int:
+        """Add a sweep, seen from the window's centre. Returns how many of its points were not finite."""
+        c, s, w = self._config, cloud.sensor_in_odom, self._window
+        points_m = without_body(cloud.points_m, transform(cloud.sensor_in_base), body_box(c))
+        heights = np.array([cloud.ground_z_m, c.ground_tolerance_m, c.robot_height_m, c.self_radius_m])
+        evidence = np.array([c.hit_log_odds, c.pass_log_odds, c.clamp_log_odds])
+        return integrate_sweep(
+            points_m, np.array([s.x_m, s.y_m, s.z_m, s.yaw_rad]), heights, evidence, w.spec.resolution_m,
+            w.spec.ix0, w.spec.iy0, w.log_odds, w.hit_weight, w.hit_x, w.hit_y,
+        )  # fmt: skip
+
+    def apply_grid(self, grid: ReadyGrid, robot: Pose, only_new: bool) -> None:
+        """Take over a ready grid (see `ready_grid`)."""
+        apply_ready_grid(grid, self._window, self._config.clamp_log_odds, only_new)
+
+    def layers(self, robot: Pose) -> tuple[RiskLayers, NDArray[np.float32]]:
+        """The risk layers and the ground's height, m: 0 everywhere."""
+        c, w = self._config, self._window
+        layers = collision_layers(
+            w.log_odds, w.hit_x, w.hit_y, w.spec.resolution_m, c.free_log_odds, c.clamp_log_odds,
+            c.collision_hazard_per_m, c.alpha, c.max_clearance_m,
+        )  # fmt: skip
+        return layers, np.zeros(w.spec.shape, dtype=np.float32)
+
+    def state(self) -> dict[str, Any]:
+        """For a snapshot."""
+        w = self._window
+        return {"spec": list(w.spec), "layers": [w.log_odds, w.hit_weight, w.hit_x, w.hit_y]}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        w = self._window
+        w.spec = GridSpec(*state["spec"])
+        w.log_odds, w.hit_weight, w.hit_x, w.hit_y = state["layers"]
