@@ -1,8 +1,8 @@
 """A reader's copy of the Global IRM: applies whole graphs and differences, and gives the graph in CSR form.
 
 Columns instead of objects: nodes sorted by id, edges by (a, b), so that equal graphs have equal bytes
-whatever the order in which they were received, and a graph of 100,000 nodes is updated in a few array
-operations.
+whatever the order in which they were received. What a difference names is found by bisection; the rest of a graph of
+100,000 nodes is copied as blocks of memory.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.kernels import njit
 from planning.search import dijkstra_csr
 
 BREADCRUMB = 0
@@ -23,6 +24,8 @@ _NODE_COLUMNS = {
     "node_gain": "float64",
     "node_coverage": "float32",
 }
+_MAX_ID = 2**26
+"""Ids are counted up from 1; a larger one is an error in the message, not a graph of this size."""
 _EDGE_COLUMNS = {"edge_distance_m": "float64", "edge_risk": "float64", "edge_driven": "uint8"}
 
 
@@ -119,11 +122,13 @@ class GraphMirror:
         whole = update.base_version == 0
         if not whole and update.base_version != self.version:
             return False
+        if not _well_formed(update):
+            return False
         node_id, nodes = _empty_nodes() if whole else (self._node_id, self._nodes)
         edge, edges = _empty_edges() if whole else (self._edge, self._edges)
         node_id, nodes = _merge_nodes(node_id, nodes, update)
         edge, edges = _merge_edges(edge, edges, update)
-        if not _consistent(node_id, edge):
+        if not _among(node_id, np.concatenate((update.edge_a, update.edge_b))):
             return False
         self._node_id, self._nodes, self._edge, self._edges = node_id, nodes, edge, edges
         self.version, self.robot_node = update.irm_version, update.robot_node
@@ -137,14 +142,12 @@ class GraphMirror:
         return self._road_map
 
     def _build(self) -> RoadMap:
-        count = self._node_id.size
-        a = np.searchsorted(self._node_id, self._edge[:, 0])
-        b = np.searchsorted(self._node_id, self._edge[:, 1])
-        rows, columns = np.concatenate((a, b)), np.concatenate((b, a))
-        order = np.lexsort((columns, rows))
-        indptr = np.zeros(count + 1, np.int32)
-        np.cumsum(np.bincount(rows, minlength=count), out=indptr[1:])
-        both = {name: np.concatenate((values, values))[order] for name, values in self._edges.items()}
+        count, edges = self._node_id.size, self._edge.shape[0]
+        index = _index_of(self._node_id)
+        indptr, indices = np.zeros(count + 1, np.int32), np.empty(2 * edges, np.int32)
+        order = np.empty(2 * edges, np.int64)
+        _fill_csr(index[self._edge[:, 0]], index[self._edge[:, 1]], indptr, indices, order)
+        both = {name: values[order] for name, values in self._edges.items()}
         return RoadMap(
             self._node_id,
             self._nodes["node_kind"],
@@ -152,7 +155,7 @@ class GraphMirror:
             self._nodes["node_gain"],
             self._nodes["node_coverage"],
             indptr,
-            columns[order].astype(np.int32),
+            indices,
             both["edge_distance_m"],
             both["edge_risk"],
             both["edge_driven"],
@@ -189,39 +192,100 @@ def _empty_edges() -> tuple[NDArray[np.int64], _Columns]:
 def _merge_nodes(
     held: NDArray[np.int64], columns: _Columns, update: GraphUpdate
 ) -> tuple[NDArray[np.int64], _Columns]:
-    keep = ~np.isin(held, np.concatenate((update.removed_node, update.node_id)))
-    ids = np.concatenate((held[keep], update.node_id))
-    order = np.argsort(ids, kind="stable")
-    merged = {n: np.concatenate((v[keep], getattr(update, n)))[order] for n, v in columns.items()}
-    return ids[order], merged
+    return _merge(held, held, columns, update.removed_node, update.node_id, update.node_id, update)
 
 
 def _merge_edges(
     held: NDArray[np.int64], columns: _Columns, update: GraphUpdate
 ) -> tuple[NDArray[np.int64], _Columns]:
     """Removed edges, edges of removed nodes, and edges that come anew give way before the new ones enter."""
-    new = np.column_stack((update.edge_a, update.edge_b)).reshape(-1, 2)
-    keep = ~np.isin(held, update.removed_node).any(axis=1)
-    keep &= ~_among(held, np.concatenate((update.removed_edge.reshape(-1, 2), new)))
-    edge = np.concatenate((held[keep], new))
-    order = np.lexsort((edge[:, 1], edge[:, 0]))
-    merged = {n: np.concatenate((v[keep], getattr(update, n)))[order] for n, v in columns.items()}
-    return edge[order], merged
+    new = np.column_stack((update.edge_a, update.edge_b)).astype(np.int64).reshape(-1, 2)
+    removed = _keys(update.removed_edge.reshape(-1, 2).astype(np.int64))
+    if update.removed_node.size:
+        # Few nodes go at once (frontiers); a graph in which many do is compared as a whole.
+        removed = np.concatenate((removed, _keys(held[np.isin(held, update.removed_node).any(axis=1)])))
+    return _merge(held, _keys(held), columns, removed, new, _keys(new), update)
 
 
-def _among(pairs: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which rows of `pairs` (n, 2) are rows of `wanted` (m, 2)."""
-    if pairs.size == 0 or wanted.size == 0:
-        return np.zeros(pairs.shape[0], np.bool_)
-    _, code = np.unique(np.concatenate((pairs, wanted)), axis=0, return_inverse=True)
-    code = code.reshape(-1)
-    return np.isin(code[: pairs.shape[0]], code[pairs.shape[0] :])
+def _keys(edge: NDArray[np.int64]) -> NDArray[np.int64]:
+    """One number for each pair of ids, in the order of the pairs."""
+    return (edge[:, 0] << 32) + edge[:, 1]
 
 
-def _consistent(node_id: NDArray[np.int64], edge: NDArray[np.int64]) -> bool:
-    """No node twice; every edge once, from a lower to a higher id, between nodes that exist."""
-    if node_id.size > 1 and bool((np.diff(node_id) == 0).any()):
+def _merge(
+    held: NDArray[np.int64],
+    keys: NDArray[np.int64],
+    columns: _Columns,
+    removed: NDArray[np.int64],
+    new: NDArray[np.int64],
+    new_keys: NDArray[np.int64],
+    update: GraphUpdate,
+) -> tuple[NDArray[np.int64], _Columns]:
+    """Rows sorted by `keys` (n,): without the removed ones, with the new ones in place of those of the same key."""
+    order = np.argsort(new_keys, kind="stable")
+    gone = _rows_of(keys, np.concatenate((removed, new_keys)))
+    kept = np.delete(keys, gone)
+    at = np.searchsorted(kept, new_keys[order])
+    merged = {
+        name: np.insert(np.delete(values, gone, axis=0), at, getattr(update, name)[order], axis=0)
+        for name, values in columns.items()
+    }
+    return np.insert(np.delete(held, gone, axis=0), at, new[order], axis=0), merged
+
+
+def _rows_of(keys: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows of ascending keys that are among the wanted ones."""
+    rows = np.searchsorted(keys, wanted)
+    rows = rows[rows < keys.size] if rows.size else rows
+    inside = np.searchsorted(keys, wanted) < keys.size
+    return np.unique(rows[keys[rows] == wanted[inside]])
+
+
+def _well_formed(update: GraphUpdate) -> bool:
+    """No node twice; every edge once, from a lower to a higher id; ids that two fit into 64 bits."""
+    edge = np.column_stack((update.edge_a, update.edge_b)).astype(np.int64).reshape(-1, 2)
+    ids = np.concatenate((update.node_id, edge.ravel()))
+    if ids.size and (int(ids.min()) < 0 or int(ids.max()) >= _MAX_ID):
         return False
-    if edge.shape[0] > 1 and bool((np.diff(edge, axis=0) == 0).all(axis=1).any()):
-        return False
-    return bool((edge[:, 0] < edge[:, 1]).all()) and bool(np.isin(edge, node_id).all())
+    twice = np.unique(update.node_id).size < update.node_id.size or np.unique(_keys(edge)).size < len(edge)
+    return not twice and bool((edge[:, 0] < edge[:, 1]).all())
+
+
+def _among(ascending: NDArray[np.int64], wanted: NDArray[np.int64]) -> bool:
+    """Whether all of the wanted ids are there."""
+    rows = np.searchsorted(ascending, wanted)
+    return bool((rows < ascending.size).all()) and bool((ascending[rows] == wanted).all())
+
+
+def _index_of(node_id: NDArray[np.int64]) -> NDArray[np.int32]:
+    """(largest id + 1,): index of each id. Ids are given one after the other, so that this is no larger than life."""
+    index = np.zeros(int(node_id[-1]) + 1 if node_id.size else 0, np.int32)
+    index[node_id] = np.arange(node_id.size, dtype=np.int32)
+    return index
+
+
+@njit
+def _fill_csr(
+    a: NDArray[np.int32],
+    b: NDArray[np.int32],
+    indptr: NDArray[np.int32],
+    indices: NDArray[np.int32],
+    order: NDArray[np.int64],
+) -> None:
+    """Both directions of edges a < b that are sorted by (a, b), rows ascending; order: (2 e,) the edge of each entry.
+
+    Of a node's neighbours the smaller ones come first (edges that end at it, by a), then the larger ones.
+    """
+    edges = a.shape[0]
+    for e in range(edges):
+        indptr[a[e] + 1] += 1
+        indptr[b[e] + 1] += 1
+    for node in range(indptr.shape[0] - 1):
+        indptr[node + 1] += indptr[node]
+    fill = indptr[:-1].copy()
+    for e in range(edges):
+        indices[fill[b[e]]], order[fill[b[e]]] = a[e], e
+        fill[b[e]] += 1
+    for e in range(edges):
+        indices[fill[a[e]]], order[fill[a[e]]] = b[e], e
+        fill[a[e]] += 1

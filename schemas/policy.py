@@ -25,8 +25,9 @@ class Alternative(Header):
 class GlobalPolicy(Message):
     """The QMDP policy over the Global IRM, in `map`.
 
-    node_id, action, value: for every node the next node of the policy (-1: stay) and V. value_to_go: V without the
-    frontiers that the local planner can reach by itself: what the rest of the mission is worth from here.
+    node_id, action, value: of the nodes around the robot and on the path (a whole graph may be large), the next node of
+    the policy (-1: stay) and V. value_to_go: V without the frontiers that the local planner can reach by itself: what
+    the rest of the mission is worth from here.
     target: frontier id (-1: none). path_xyz_m: from the robot's node to the target.
     """
 

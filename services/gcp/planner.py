@@ -21,6 +21,7 @@ from services.gcp.qmdp import (
     edge_terms,
     global_graph,
     label_setting,
+    label_setting_to,
     relocation_q,
     solve,
 )
@@ -137,7 +138,9 @@ class GlobalPlanner:
         """
         target = np.array([frontier], np.int32)
         action = np.empty(self.road_map.node_id.size, np.int32)
-        value = label_setting(self.graph, target, -np.inf, -1, action)
+        value = label_setting_to(
+            self.graph, target, -np.inf, self._labelled(candidates.node, frontier), action
+        )
         at = value[candidates.node]
         if not np.isfinite(at).any():
             return None
@@ -150,6 +153,10 @@ class GlobalPlanner:
         distance_m, risk = self._measure(path)
         gain = float(self.road_map.gain[frontier])
         return Option(frontier, float(q.max()), gain, straight + distance_m, risk, path)
+
+    def _labelled(self, nodes: Indices, frontier: int) -> Indices:
+        """Those of the nodes that get a label on the way to a frontier: not the other frontiers."""
+        return nodes[~self.graph.terminal[nodes] | (nodes == frontier)]
 
     def way_home(self, start: int, home: int) -> Option | None:
         """The cheapest way to a node, without discount, in which frontiers may be crossed; None when there

@@ -169,11 +169,30 @@ def label_setting(
     The result is the exact value of the policy in `action`, which never cycles. Without labels: -inf and STAY.
     Stops once `stop_node` is settled (-1: never).
     """
+    wanted = np.full(1 if stop_node >= 0 else 0, stop_node, np.int32)
+    return label_setting_to(graph, targets, floor, wanted, action)
+
+
+@njit
+def label_setting_to(
+    graph: GlobalGraph,
+    targets: NDArray[np.int32],
+    floor: float,
+    wanted: NDArray[np.int32],
+    action: NDArray[np.int32],
+) -> NDArray[np.float64]:
+    """`label_setting` that stops once all nodes in `wanted` (no node twice; empty: never) are settled.
+
+    Then only they, and the nodes on their ways, have their best labels; those of other nodes may be too low.
+    """
     nodes = graph.terminal.shape[0]
     key = np.full(nodes, np.inf)  # minus the label: the heap gives the smallest key first
     place = np.full(nodes, -1, np.int32)
     heap = np.empty(nodes, np.int32)
     settled = np.zeros(nodes, np.bool_)
+    is_wanted = np.zeros(nodes, np.bool_)
+    is_wanted[wanted] = True
+    left = wanted.shape[0]
     action[:] = STAY
     size = 0
     for k in range(targets.shape[0]):
@@ -182,8 +201,10 @@ def label_setting(
         node = heap_pop(heap, place, key, size)
         size -= 1
         settled[node] = True
-        if node == stop_node:
-            break
+        if is_wanted[node]:
+            left -= 1
+            if left == 0:
+                break
         for slot in range(graph.reverse_indptr[node], graph.reverse_indptr[node + 1]):
             other, edge = graph.reverse_source[slot], graph.reverse_edge[slot]
             if settled[other] or graph.terminal[other] or graph.cost[edge] == np.inf:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from planning.frames import Planar
 from planning.graph_mirror import GraphMirror, RoadMap
@@ -204,6 +205,7 @@ class GcpStage:
             path_node = np.append(path_node, path_node[-1:])
             path_xyz = np.vstack((path_xyz, np.array(choice.extra_xyz_m)))
         place = path_xyz[-1] if option is not None else robot
+        told = _nodes_to_tell(road_map, robot, path, self.config.policy_radius_m)
         return GlobalPolicy(
             stamp_ns=now,
             irm_version=self._mirror.version,
@@ -217,11 +219,11 @@ class GcpStage:
             reason=choice.reason,
             alternatives=[_alternative(planner, other) for other in choice.alternatives],
             map_to_odom=odometry.map_to_odom,
-            node_id=road_map.node_id,
-            node_xyz_m=road_map.xyz_m,
-            action=values[0].action,
-            value=values[0].value,
-            value_to_go=values[1].value,
+            node_id=road_map.node_id[told],
+            node_xyz_m=road_map.xyz_m[told],
+            action=values[0].action[told],
+            value=values[0].value[told],
+            value_to_go=values[1].value[told],
             path_node=path_node,
             path_xyz_m=path_xyz,
         )
@@ -256,6 +258,15 @@ class GcpStage:
         state = unpack_snapshot(record)
         target, x_m, y_m, z_m, gain = state["target"]
         self._target, self._tick = _Target(target, (x_m, y_m, z_m), gain), state["tick"]
+
+
+def _nodes_to_tell(
+    road_map: RoadMap, robot: Floats, path: NDArray[np.int32], radius_m: float
+) -> NDArray[np.int64]:
+    """Indices, ascending, of the nodes around the robot and on its path: what readers need, however large the graph."""
+    near = np.square(road_map.xyz_m - robot).sum(axis=1) <= radius_m**2
+    near[path] = True
+    return np.flatnonzero(near)
 
 
 def _robot_xyz(odometry: Odometry) -> tuple[float, float, float]:

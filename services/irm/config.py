@@ -34,6 +34,12 @@ class Config(BaseModel):
     covered_probability: float = Field(
         0.9, gt=0.5, lt=1, description="From this probability a cell is covered."
     )
+    blur_from_m: float = Field(
+        0.5,
+        ge=0,
+        le=100,
+        description="What was seen from keyframes less certain than this relative to the robot counts less, m; 0: off.",
+    )
     # traversability
     clearance_margin_m: float = Field(0.0, ge=-0.05, le=1, description="Added to the footprint's radius, m.")
     clearance_hysteresis_m: float = Field(0.03, ge=0, le=0.2, description="What was passable stays so, m.")

@@ -2,7 +2,7 @@
 
 A footprint is a set of cells. All scans that are joined to a keyframe make one footprint, which is one Bayes update
 of the cells in it. When SLAM moves the keyframe, its footprint moves along: what it added to the coverage is taken
-back and added where it now lies.
+back and added where it now lies. The cells are kept as they were seen, so that moving them often does not wear them.
 """
 
 from __future__ import annotations
@@ -19,20 +19,37 @@ from planning.frames import Planar
 from planning.grid import FREE, GridSpec, overlap
 from planning.rays import visible_cells
 from schemas.sensing import CoverageScan
+from services.irm.keyframes import IDENTITY, has_moved
+from services.irm.resample import moved
 from services.irm.tiles import TileLayer
 
-_MOVED_M = 0.02
-_MOVED_RAD = 0.002
+BLUR_LEVELS = 5
+"""Steps of the blur, by a factor of the square root of 2 each."""
 
 
 @dataclass(slots=True)
 class _Footprint:
-    """Cells in `map` as they lay when the keyframe was at `pose`; log_odds: evidence of being seen once."""
+    """Cells in `map` as they lay when the keyframe was at `pose`; placed: where it is now.
+
+    log_odds: evidence of being seen once; blur: level by which it is weakened.
+    """
 
     pose: Planar
     spec: GridSpec
     seen: NDArray[np.bool_]
     log_odds: float
+    placed: Planar
+    blur: int = 0
+
+    @property
+    def motion(self) -> Planar:
+        """What SLAM has moved it by."""
+        return IDENTITY if self.placed == self.pose else self.placed.compose(self.pose.inverse())
+
+    @property
+    def evidence(self) -> float:
+        """Log-odds that it adds to the coverage of its cells."""
+        return self.log_odds if self.blur == 0 else self.log_odds * 2.0 ** (-0.5 * self.blur)
 
 
 class FootprintStore:
@@ -41,6 +58,7 @@ class FootprintStore:
     def __init__(self, coverage: TileLayer) -> None:
         self._coverage = coverage
         self._footprints: dict[int, _Footprint] = {}
+        self._blurred: set[int] = set()
         self._changed: set[int] = set()
 
     def add(
@@ -58,12 +76,14 @@ class FootprintStore:
         patch, seen = _look(scan, state, spec)
         if patch is None:
             return 0
-        if not odom_to_map.is_identity:
-            patch, seen = _moved(patch, seen, odom_to_map)
         held = self._footprints.get(scan.keyframe_id)
+        back = IDENTITY if held is None else held.motion.inverse()
+        place = odom_to_map if back.is_identity else back.compose(odom_to_map)
+        patch, seen = moved(patch, seen, place)
         if held is None:
             empty = np.zeros(patch.shape, dtype=np.bool_)
-            held = _Footprint(keyframe, patch, empty, look_log_odds(scan.detection_probability))
+            odds = look_log_odds(scan.detection_probability)
+            held = _Footprint(keyframe, patch, empty, odds, keyframe)
             self._footprints[scan.keyframe_id] = held
         self._grow(held, patch)
         common = overlap(held.spec, patch)
@@ -73,7 +93,7 @@ class FootprintStore:
         held.seen |= new
         if new.any():
             self._changed.add(scan.keyframe_id)
-        self._add_evidence(held.spec, new, held.log_odds)
+        self._add_evidence(*moved(held.spec, new, held.motion), held.evidence)
         return int(new.sum())
 
     @staticmethod
@@ -96,19 +116,42 @@ class FootprintStore:
 
     def follow(self, keyframes: dict[int, Planar]) -> int:
         """Move the footprints of keyframes that SLAM has moved. Returns how many moved."""
-        moved = 0
-        for keyframe_id in sorted(self._footprints):
-            held, pose = self._footprints[keyframe_id], keyframes.get(keyframe_id)
-            if pose is None or not _has_moved(held.pose, pose):
+        count = 0
+        for keyframe_id in sorted(keyframes.keys() & self._footprints.keys()):
+            held, pose = self._footprints[keyframe_id], keyframes[keyframe_id]
+            if not has_moved(held.placed, pose):
                 continue
-            self._add_evidence(held.spec, held.seen, -held.log_odds)
-            change = pose.compose(held.pose.inverse())
-            spec, seen = _moved(held.spec, held.seen, change)
-            self._footprints[keyframe_id] = _Footprint(pose, spec, seen, held.log_odds)
+            self._add_evidence(*moved(held.spec, held.seen, held.motion), -held.evidence)
+            held.placed = pose
             self._changed.add(keyframe_id)
-            self._add_evidence(spec, seen, held.log_odds)
-            moved += 1
-        return moved
+            self._add_evidence(*moved(held.spec, held.seen, held.motion), held.evidence)
+            count += 1
+        return count
+
+    def blur(self, deviations_m: dict[int, float], from_m: float) -> int:
+        """Weaken what was seen from keyframes whose place relative to the robot's is uncertain (DESIGN 3, irm).
+
+        deviations_m: standard deviation by keyframe, of those around the robot; the others keep their level.
+        Returns how many changed.
+        """
+        if from_m <= 0.0:
+            return 0
+        levels = {
+            k: blur_level(d, from_m) for k, d in deviations_m.items() if d > from_m or k in self._blurred
+        }
+        changed = 0
+        for keyframe_id in sorted(levels.keys() & self._footprints.keys()):
+            held, level = self._footprints[keyframe_id], levels[keyframe_id]
+            if level == held.blur:
+                continue
+            spec, cells = moved(held.spec, held.seen, held.motion)
+            before = held.evidence
+            held.blur = level
+            self._add_evidence(spec, cells, held.evidence - before)
+            (self._blurred.add if level else self._blurred.discard)(keyframe_id)
+            self._changed.add(keyframe_id)
+            changed += 1
+        return changed
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
@@ -117,6 +160,7 @@ class FootprintStore:
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot, with the coverage layer as it was then."""
         self._footprints = {int(key): _unpack(packed) for key, packed in state.items()}
+        self._blurred = {k for k, f in self._footprints.items() if f.blur}
 
     def take_changes(self) -> dict[str, Any]:
         """The footprints that have changed since the last call: for the journal."""
@@ -126,31 +170,40 @@ class FootprintStore:
     def apply_changes(self, changes: dict[str, Any]) -> None:
         """Take in changes from the journal: footprints and what they add to the coverage."""
         for key, packed in changes.items():
-            self._footprints[int(key)] = self._replace(self._footprints.get(int(key)), _unpack(packed))
+            new = _unpack(packed)
+            self._replace(self._footprints.get(int(key)), new)
+            self._footprints[int(key)] = new
+            (self._blurred.add if new.blur else self._blurred.discard)(int(key))
 
-    def _replace(self, old: _Footprint | None, new: _Footprint) -> _Footprint:
+    def _replace(self, old: _Footprint | None, new: _Footprint) -> None:
         """Only the difference is counted when the keyframe has not moved: sums of evidence stay exact."""
         fresh = new.seen.copy()
-        if old is not None and old.pose == new.pose:
+        if old is not None and (old.placed, old.blur) == (new.placed, new.blur):
             common = overlap(new.spec, old.spec)
             assert common is not None  # footprints only grow
             fresh[common[0]] &= ~old.seen[common[1]]
         elif old is not None:
-            self._add_evidence(old.spec, old.seen, -old.log_odds)
-        self._add_evidence(new.spec, fresh, new.log_odds)
-        return new
+            self._add_evidence(*moved(old.spec, old.seen, old.motion), -old.evidence)
+        self._add_evidence(*moved(new.spec, fresh, new.motion), new.evidence)
 
 
 def _pack(footprint: _Footprint) -> list[Any]:
     f = footprint
-    return [list(f.pose), list(f.spec), np.packbits(f.seen), f.log_odds]
+    return [list(f.pose), list(f.spec), np.packbits(f.seen), f.log_odds, list(f.placed), f.blur]
 
 
 def _unpack(packed: list[Any]) -> _Footprint:
-    pose, spec_fields, bits, log_odds = packed
+    pose, spec_fields, bits, log_odds, placed, blur = packed
     spec = GridSpec(*spec_fields)
     seen = np.unpackbits(bits, count=spec.width * spec.height).astype(np.bool_).reshape(spec.shape)
-    return _Footprint(Planar(*pose), spec, seen, float(log_odds))
+    return _Footprint(Planar(*pose), spec, seen, float(log_odds), Planar(*placed), blur)
+
+
+def blur_level(deviation_m: float, from_m: float) -> int:
+    """0 up to `from_m`; the evidence falls as from_m / deviation from there on, in steps, to a quarter at most."""
+    if deviation_m <= from_m or from_m <= 0.0:
+        return 0
+    return min(BLUR_LEVELS - 1, round(2.0 * math.log2(deviation_m / from_m)))
 
 
 def _look(
@@ -171,42 +224,3 @@ def _look(
     y_cells = pose.y_m / resolution - patch.iy0
     visible_cells(piece != FREE, x_cells, y_cells, scan.range_m / resolution, pose.yaw_rad, scan.fov_rad, out)
     return patch, (out != 0) & (piece == FREE)
-
-
-def _has_moved(a: Planar, b: Planar) -> bool:
-    turned = abs(math.remainder(a.yaw_rad - b.yaw_rad, 2.0 * math.pi))
-    return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) > _MOVED_M or turned > _MOVED_RAD
-
-
-def _moved(spec: GridSpec, cells: NDArray[np.bool_], by: Planar) -> tuple[GridSpec, NDArray[np.bool_]]:
-    """The cells after a rigid motion: every cell of the new place asks where it came from, so no holes appear."""
-    res = spec.resolution_m
-    corners = [
-        by.apply((spec.ix0 + cx) * res, (spec.iy0 + cy) * res)
-        for cx in (0, spec.width)
-        for cy in (0, spec.height)
-    ]
-    ix0 = math.floor(min(c[0] for c in corners) / res)
-    iy0 = math.floor(min(c[1] for c in corners) / res)
-    width = math.floor(max(c[0] for c in corners) / res) - ix0 + 1
-    height = math.floor(max(c[1] for c in corners) / res) - iy0 + 1
-    target = GridSpec(res, ix0, iy0, width, height)
-    return target, resample(cells, spec, target, by, False)
-
-
-def resample(
-    values: NDArray[Any], spec: GridSpec, target: GridSpec, target_from_source: Planar, fill: Any
-) -> NDArray[Any]:
-    """Nearest-cell values of a layer over another grid in another frame.
-
-    target_from_source: pose of the source's frame in the target's. Cells that come from outside get `fill`.
-    """
-    back = target_from_source.inverse()
-    c, s = math.cos(back.yaw_rad), math.sin(back.yaw_rad)
-    x, y = np.meshgrid(target.centres_x(), target.centres_y())
-    column = np.floor((back.x_m + c * x - s * y) / spec.resolution_m).astype(np.int64) - spec.ix0
-    row = np.floor((back.y_m + s * x + c * y) / spec.resolution_m).astype(np.int64) - spec.iy0
-    inside = (row >= 0) & (row < spec.height) & (column >= 0) & (column < spec.width)
-    out = np.full(target.shape, fill, dtype=values.dtype)
-    out[inside] = values[row[inside], column[inside]]
-    return out

@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import astuple, dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from planning.clusters import component_centroids, label_components
-from planning.coverage import LOG_2
+from planning.frames import Planar
 from planning.grid import FREE, LETHAL, UNKNOWN
-from planning.kernels import njit
+from services.irm.borders import Found, find_frontiers, least_gain
 from services.irm.config import Config
+from services.irm.keyframes import NOBODY, Anchor
+from services.irm.spatial import SpatialHash
 from services.irm.window import Window
 
 
 @dataclass(slots=True)
 class Frontier:
-    """A frontier node. x_m, y_m: a place that the robot's centre can reach. gain: nats of whole patches."""
+    """A frontier node. x_m, y_m: a place in `map` that the robot's centre can reach. gain: nats of whole patches.
+
+    keyframe: what it belongs to since it was last seen; local_*: its place in that keyframe's frame.
+    """
 
     node_id: int
     x_m: float
@@ -39,20 +40,17 @@ class Frontier:
     again: bool = False
     opening: bool = False
     rounds: int = 0
-
-
-class Found(NamedTuple):
-    """A frontier as it is found in a window. opening: mostly for what may lie behind the edge of the unseen."""
-
-    x_m: float
-    y_m: float
-    gain: float
-    opening: bool
+    keyframe: int = NOBODY
+    local_x_m: float = 0.0
+    local_y_m: float = 0.0
 
 
 @dataclass(slots=True)
 class GivenUp:
-    """A frontier that was given up, why, when it may come back, and whether it has come back before."""
+    """A frontier that was given up, why, when it may come back, and whether it has come back before.
+
+    Place and keyframe as there.
+    """
 
     x_m: float
     y_m: float
@@ -60,15 +58,24 @@ class GivenUp:
     reason: str
     until_ns: int
     again: bool = False
+    keyframe: int = NOBODY
+    local_x_m: float = 0.0
+    local_y_m: float = 0.0
 
 
 @dataclass(slots=True)
 class FrontierManager:
-    """Finds, names, prunes and gives up frontiers."""
+    """Finds, names, prunes and gives up frontiers. dropped, dropped_gain: too little in a world that has grown."""
 
     config: Config
     frontiers: dict[int, Frontier] = field(default_factory=dict)
     given_up: list[GivenUp] = field(default_factory=list)
+    dropped: int = 0
+    dropped_gain: float = 0.0
+    _places: SpatialHash = field(default_factory=SpatialHash)
+    _changed: set[int] = field(default_factory=set)
+    _pursued: set[int] = field(default_factory=set)
+    _least: float = 0.0
 
     def update(
         self,
@@ -78,14 +85,19 @@ class FrontierManager:
         elapsed_s: float,
         next_id: int,
         ground_m2: float = 0.0,
+        anchor: Anchor = Anchor(),  # noqa: B008
     ) -> int:
-        """Look at the window again. elapsed_s: since the last call; ground_m2: known so far. Returns the next id."""
+        """Look at the window again. Returns the next id.
+
+        robot: its place in `map`. elapsed_s: since the last call; ground_m2: known so far; anchor: the keyframe that
+        the robot is at.
+        """
         next_id = self._second_chances(next_id)
         self.given_up = [g for g in self.given_up if g.until_ns > now_ns]
         least = least_gain(self.config, ground_m2)
         found = [f for f in find_frontiers(window, self.config, least) if not self._is_given_up(f[0], f[1])]
-        self.frontiers = {k: f for k, f in self.frontiers.items() if f.gain >= least}
-        inside = [f for f in self.frontiers.values() if _in_window(window, f)]
+        self._drop_small(window, least)
+        inside = [self.frontiers[k] for k in sorted(self.near(window))]
         for frontier in inside:
             frontier.seen = False
         taken: set[int] = set()
@@ -93,21 +105,53 @@ class FrontierManager:
             if index in taken or self.frontiers[node_id].seen or distance > self.config.frontier_same_m:
                 continue
             taken.add(index)
-            frontier = self.frontiers[node_id]
-            if math.hypot(found[index][0] - frontier.x_m, found[index][1] - frontier.y_m) > 0.5:
-                frontier.beside_s, frontier.pursued_s, frontier.nearest_m = 0.0, 0.0, math.inf
-            frontier.x_m, frontier.y_m, frontier.gain, frontier.opening = found[index]
-            frontier.seen, frontier.missed = True, 0
-            frontier.rounds += 1
+            self._see_again(self.frontiers[node_id], found[index], anchor)
         for frontier in inside:
             if not frontier.seen:
                 self._miss(frontier, window, robot, now_ns)
         for index, (x, y, gain, opening) in enumerate(found):
             if index not in taken:
-                self.frontiers[next_id] = Frontier(next_id, x, y, gain, opening=opening)
+                self._put(Frontier(next_id, x, y, gain, opening=opening), anchor)
                 next_id += 1
-        self._watch(robot, now_ns, elapsed_s)
+        self._watch(window, robot, now_ns, elapsed_s)
         return next_id
+
+    def near(self, window: Window) -> list[int]:
+        """The frontiers that lie in the window."""
+        s = window.spec
+        x, y = window.to_map(*s.centre_of(s.height // 2, s.width // 2))
+        radius = 0.5 * math.hypot(s.height + 2, s.width + 2) * s.resolution_m
+        around = (k for k in self._places.around(x, y, radius) if k in self.frontiers)
+        return [k for k in around if _in_window(window, self.frontiers[k])]
+
+    def take_changes(self) -> set[int]:
+        """Ids of the frontiers that are new, other than before or gone since the last call."""
+        changed, self._changed = self._changed, set()
+        return changed
+
+    def follow(self, keyframes: dict[int, Planar]) -> list[int]:
+        """Move what belongs to keyframes that SLAM has moved. Returns the ids of the frontiers that moved."""
+        for g in self.given_up:
+            if g.keyframe in keyframes:
+                g.x_m, g.y_m = keyframes[g.keyframe].apply(g.local_x_m, g.local_y_m)
+        moved = [k for k in sorted(self.frontiers) if self.frontiers[k].keyframe in keyframes]
+        for node_id in moved:
+            f = self.frontiers[node_id]
+            f.x_m, f.y_m = keyframes[f.keyframe].apply(f.local_x_m, f.local_y_m)
+            self._places.put(node_id, f.x_m, f.y_m)
+            self._changed.add(node_id)
+        return moved
+
+    def _put(self, frontier: Frontier, anchor: Anchor) -> None:
+        """A frontier is there, or elsewhere than before, as seen from this keyframe."""
+        frontier.keyframe = anchor.keyframe
+        frontier.local_x_m, frontier.local_y_m = anchor.local(frontier.x_m, frontier.y_m)
+        self._keep(frontier)
+
+    def _keep(self, frontier: Frontier) -> None:
+        self.frontiers[frontier.node_id] = frontier
+        self._places.put(frontier.node_id, frontier.x_m, frontier.y_m)
+        self._changed.add(frontier.node_id)
 
     def _second_chances(self, next_id: int) -> int:
         """With nothing else left, frontiers with much to gain that were given up come back, once."""
@@ -115,13 +159,40 @@ class FrontierManager:
             return next_id
         for g in [g for g in self.given_up if g.gain >= self.config.second_chance_gain and not g.again]:
             self.given_up.remove(g)
-            self.frontiers[next_id] = Frontier(next_id, g.x_m, g.y_m, g.gain, again=True)
+            back = Frontier(next_id, g.x_m, g.y_m, g.gain, again=True, keyframe=g.keyframe)
+            back.local_x_m, back.local_y_m = g.local_x_m, g.local_y_m
+            self._keep(back)
             next_id += 1
         return next_id
 
+    def _see_again(self, frontier: Frontier, found: Found, anchor: Anchor) -> None:
+        if math.hypot(found.x_m - frontier.x_m, found.y_m - frontier.y_m) > 0.5:
+            frontier.beside_s, frontier.pursued_s, frontier.nearest_m = 0.0, 0.0, math.inf
+        frontier.x_m, frontier.y_m, frontier.gain, frontier.opening = found
+        frontier.seen, frontier.missed = True, 0
+        frontier.rounds += 1
+        self._put(frontier, anchor)
+
+    def _forget(self, node_id: int) -> None:
+        self.frontiers.pop(node_id, None)
+        self._places.drop(node_id)
+        self._pursued.discard(node_id)
+        self._changed.add(node_id)
+
+    def _drop_small(self, window: Window, least: float) -> None:
+        """What was worth a trip in a smaller world may be no more; those in the window may yet be found again."""
+        if least <= self._least:
+            return
+        self._least = least
+        for f in [f for f in self.frontiers.values() if f.gain < least]:
+            self._forget(f.node_id)
+            if not _in_window(window, f):
+                self.dropped += 1
+                self.dropped_gain += f.gain
+
     def _miss(self, frontier: Frontier, window: Window, robot: tuple[float, float], now_ns: int) -> None:
         """A frontier in the window that was not found again: covered, forgotten by the risk map, or cut off."""
-        row, column = window.spec.cell_of(frontier.x_m, frontier.y_m)
+        row, column = window.cell(frontier.x_m, frontier.y_m)
         if window.state[row, column] == UNKNOWN:
             return
         reach = round(1.0 / window.spec.resolution_m)
@@ -134,19 +205,19 @@ class FrontierManager:
             if away_m > self.config.opening_range_m - 1.0:
                 return  # openings are looked for near the robot only
         if frontier.opening and frontier.rounds < self.config.opening_rounds:
-            del self.frontiers[frontier.node_id]
+            self._forget(frontier.node_id)
             return
         looked = window.probability[near] >= self.config.covered_probability
         open_ground = (
             (window.state[near] != LETHAL) & ~looked & (window.ground[near] | (window.state[near] == FREE))
         )
         if not open_ground.any():
-            del self.frontiers[frontier.node_id]
+            self._forget(frontier.node_id)
             return
         frontier.missed += 1
         if frontier.missed > self.config.missed_rounds:
             if window.reachable[near].any():
-                del self.frontiers[frontier.node_id]
+                self._forget(frontier.node_id)
             else:
                 self.give_up(frontier, "cut off: no way for the robot was found", now_ns)
 
@@ -161,9 +232,9 @@ class FrontierManager:
         near = 0.7 * self.config.give_up_radius_m
         return any(math.hypot(g.x_m - x_m, g.y_m - y_m) < near for g in self.given_up)
 
-    def _watch(self, robot: tuple[float, float], now_ns: int, elapsed_s: float) -> None:
+    def _watch(self, window: Window, robot: tuple[float, float], now_ns: int, elapsed_s: float) -> None:
         """Give up frontiers beside which the robot has been for long and that yield nothing."""
-        for node_id in sorted(self.frontiers):
+        for node_id in sorted(self.near(window)):
             f = self.frontiers[node_id]
             if f.gain < 0.9 * f.best_gain:
                 f.best_gain, f.beside_s, f.pursued_s = f.gain, 0.0, 0.0
@@ -174,8 +245,9 @@ class FrontierManager:
 
     def progressed(self) -> None:
         """Ground was covered somewhere: the robot has better to do than to go to its target, which loses no time."""
-        for frontier in self.frontiers.values():
-            frontier.pursued_s = 0.0
+        for node_id in self._pursued:
+            self.frontiers[node_id].pursued_s = 0.0
+        self._pursued.clear()
 
     def pursue(self, node_id: int, distance_m: float, now_ns: int, elapsed_s: float) -> None:
         """The global planner's target is this frontier, so far away: give it up when the robot gets no nearer."""
@@ -186,263 +258,39 @@ class FrontierManager:
             f.nearest_m, f.pursued_s = distance_m, 0.0
             return
         f.pursued_s += elapsed_s
+        self._pursued.add(node_id)
         if f.pursued_s > self.config.pursue_s:
             self.give_up(f, "pursued in vain: the robot got no nearer", now_ns)
 
     def give_up(self, frontier: Frontier, reason: str, now_ns: int) -> None:
         """Take a frontier off the list for a while."""
         until = now_ns + int(self.config.retry_after_s * 1e9)
+        f = frontier
         self.given_up.append(
-            GivenUp(frontier.x_m, frontier.y_m, frontier.gain, reason, until, frontier.again)
+            GivenUp(f.x_m, f.y_m, f.gain, reason, until, f.again, f.keyframe, f.local_x_m, f.local_y_m)
         )
-        self.frontiers.pop(frontier.node_id, None)
+        self._forget(f.node_id)
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
         return {
             "frontiers": [list(astuple(f)) for _, f in sorted(self.frontiers.items())],
             "given_up": [list(astuple(g)) for g in self.given_up],
+            "dropped": [self.dropped, self.dropped_gain, self._least],
         }
 
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot."""
-        self.frontiers = {int(f[0]): Frontier(int(f[0]), *f[1:]) for f in state["frontiers"]}
+        self.frontiers, self._places = {}, SpatialHash()
+        for values in state["frontiers"]:
+            f = Frontier(int(values[0]), *values[1:])
+            self.frontiers[f.node_id] = f
+            self._places.put(f.node_id, f.x_m, f.y_m)
         self.given_up = [GivenUp(*g) for g in state["given_up"]]
+        self.dropped, self.dropped_gain, self._least = state["dropped"]
+        self._pursued = {k for k, f in self.frontiers.items() if f.pursued_s > 0.0}
+        self._changed = set(self.frontiers)
 
 
 def _in_window(window: Window, frontier: Frontier) -> bool:
-    row, column = window.spec.cell_of(frontier.x_m, frontier.y_m)
-    return window.spec.contains(row, column)
-
-
-def least_gain(config: Config, ground_m2: float) -> float:
-    """The gain from which a border is a frontier: a share of the ground known, within the two bounds, nats."""
-    share = config.frontier_min_share * ground_m2 / config.spacing_m**2 * LOG_2
-    return max(config.frontier_min_gain, min(share, config.frontier_enough_gain))
-
-
-def find_frontiers(window: Window, config: Config, least: float | None = None) -> list[Found]:
-    """The frontiers of a window with at least this expected information gain, in a fixed order.
-
-    The uncovered ground is split into connected pieces; the border of a piece with covered ground is cut into blocks
-    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Where the
-    robot's centre can get to the border of ground never seen that it may well enter (the way around a corner; not a
-    gap in a ragged wall that its body does not fit), that is open too, and counts what ground may lie behind. Such
-    openings are looked for near the robot only: far walls that it sees at a slant are full of holes.
-    """
-    s = window.spec
-    labels = np.zeros(s.shape, np.int32)
-    openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
-    openings &= near_robot(window, config.opening_range_m)
-    open_ground = window.uncovered | openings
-    pieces = label_components(open_ground, labels)
-    if pieces == 0:
-        return []
-    block = np.full(s.shape, -1, np.int32)
-    cells = max(1, round(config.frontier_block_m / s.resolution_m))
-    covered = window.ground & ~open_ground
-    blocks = mark_borders(open_ground, covered, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block)
-    if blocks == 0:
-        return []
-    reach = round(config.frontier_reach_m / s.resolution_m)
-    spread_blocks(open_ground, block, reach, blocks)
-    behind = np.zeros(s.shape, np.int32)
-    sizes = component_centroids(behind, label_components(window.hopeful, behind))[0]
-    gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
-    block_gains(window.entropy, behind, sizes, block, gain, sums, hidden)
-    hidden *= s.resolution_m**2
-    gain += np.minimum(hidden * LOG_2 / config.spacing_m**2, config.unknown_max_gain)
-    places = block_places(window.reachable, block, sums, round(1.0 / s.resolution_m))
-    piece_of = np.zeros(blocks, np.int64)
-    inside = block >= 0
-    piece_of[block[inside]] = labels[inside]
-    least = config.frontier_min_gain if least is None else least
-    opening = hidden >= config.opening_min_m2 - 1e-9
-    # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
-    gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
-    return _select(gain, opening, places, piece_of, window, least)
-
-
-def near_robot(window: Window, range_m: float) -> NDArray[np.bool_]:
-    """Cells within a distance of the robot's cell."""
-    rows = np.arange(window.spec.height) - window.robot_cell[0]
-    columns = np.arange(window.spec.width) - window.robot_cell[1]
-    near: NDArray[np.bool_] = (
-        rows[:, None] ** 2 + columns[None, :] ** 2 <= (range_m / window.spec.resolution_m) ** 2
-    )
-    return near
-
-
-def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells with a side in common with a cell of the mask."""
-    padded = np.pad(mask, 1)
-    near: NDArray[np.bool_] = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
-    return near
-
-
-def _select(
-    gain: NDArray[np.float64],
-    opening: NDArray[np.bool_],
-    places: NDArray[np.int64],
-    piece_of: NDArray[np.int64],
-    window: Window,
-    least: float,
-) -> list[Found]:
-    """Blocks with enough gain; of a piece of many small blocks that is worth it as a whole, its best block."""
-    found = []
-    total = np.bincount(piece_of, weights=gain, minlength=int(piece_of.max()) + 1)
-    best: dict[int, int] = {}
-    for index in range(len(gain)):
-        piece = int(piece_of[index])
-        if piece not in best or gain[index] > gain[best[piece]]:
-            best[piece] = index
-    for index in range(len(gain)):
-        piece = int(piece_of[index])
-        alone = gain[index] >= least
-        together = best[piece] == index and total[piece] >= least
-        if places[index, 0] >= 0 and (alone or together):
-            x, y = window.spec.centre_of(int(places[index, 0]), int(places[index, 1]))
-            found.append(Found(x, y, float(gain[index] if alone else total[piece]), bool(opening[index])))
-    return found
-
-
-@njit
-def mark_borders(
-    uncovered: NDArray[np.bool_],
-    covered: NDArray[np.bool_],
-    labels: NDArray[np.int32],
-    ix0: int,
-    iy0: int,
-    cells: int,
-    pieces: int,
-    robot: tuple[int, int],
-    block: NDArray[np.int32],
-) -> int:
-    """Number the border cells by (piece, snapped block); a piece without a border gets its cell nearest the robot.
-
-    labels: (h, w), 0 outside, 1..pieces. block: out, -1 elsewhere. Returns how many blocks there are.
-    """
-    height, width = uncovered.shape
-    bx0, by0 = ix0 // cells, iy0 // cells
-    across = (ix0 + width) // cells - bx0 + 1
-    down = (iy0 + height) // cells - by0 + 1
-    number = np.full((pieces + 1) * across * down, -1, np.int32)
-    has_border = np.zeros(pieces + 1, np.bool_)
-    nearest = np.full(pieces + 1, -1, np.int64)
-    nearest_distance = np.full(pieces + 1, np.inf)
-    blocks = 0
-    for row in range(height):
-        for column in range(width):
-            if not uncovered[row, column]:
-                continue
-            piece = labels[row, column]
-            distance = float((row - robot[0]) ** 2 + (column - robot[1]) ** 2)
-            if distance < nearest_distance[piece]:
-                nearest_distance[piece], nearest[piece] = distance, row * width + column
-            border = False
-            for r in range(max(0, row - 1), min(height, row + 2)):
-                for c in range(max(0, column - 1), min(width, column + 2)):
-                    border = border or covered[r, c]
-            if not border:
-                continue
-            has_border[piece] = True
-            key = (piece * down + (iy0 + row) // cells - by0) * across + (ix0 + column) // cells - bx0
-            if number[key] < 0:
-                number[key] = blocks
-                blocks += 1
-            block[row, column] = number[key]
-    for piece in range(1, pieces + 1):
-        if not has_border[piece] and nearest[piece] >= 0:
-            block[nearest[piece] // width, nearest[piece] % width] = blocks
-            blocks += 1
-    return blocks
-
-
-@njit
-def spread_blocks(uncovered: NDArray[np.bool_], block: NDArray[np.int32], reach: int, blocks: int) -> None:
-    """Breadth-first: each uncovered cell takes the number of the block that gets to it first, within `reach` steps.
-
-    block: (h, w), changed in place; cells that the border gave keep their number.
-    """
-    height, width = uncovered.shape
-    queue = np.empty(height * width, np.int64)
-    depth = np.zeros((height, width), np.int32)
-    head, tail = 0, 0
-    for row in range(height):
-        for column in range(width):
-            if block[row, column] >= 0:
-                queue[tail] = row * width + column
-                tail += 1
-    while head < tail:
-        row, column = queue[head] // width, queue[head] % width
-        head += 1
-        if depth[row, column] >= reach:
-            continue
-        for r in range(max(0, row - 1), min(height, row + 2)):
-            for c in range(max(0, column - 1), min(width, column + 2)):
-                if uncovered[r, c] and block[r, c] < 0:
-                    block[r, c] = block[row, column]
-                    depth[r, c] = depth[row, column] + 1
-                    queue[tail] = r * width + c
-                    tail += 1
-
-
-@njit
-def block_gains(
-    entropy: NDArray[np.float32],
-    behind: NDArray[np.int32],
-    sizes: NDArray[np.int64],
-    block: NDArray[np.int32],
-    gain: NDArray[np.float64],
-    sums: NDArray[np.float64],
-    hidden: NDArray[np.float64],
-) -> None:
-    """Entropy of each block's cells, and the size of the largest piece of hopeful ground that they border on (hidden).
-
-    behind: (h, w) labels of the pieces of hopeful ground, 0 elsewhere. sizes: cells of piece k + 1. sums: (blocks, 3):
-    number of cells, sum of rows, sum of columns.
-    """
-    height, width = block.shape
-    for row in range(height):
-        for column in range(width):
-            b = block[row, column]
-            if b < 0:
-                continue
-            gain[b] += entropy[row, column]
-            sums[b, 0] += 1.0
-            sums[b, 1] += row
-            sums[b, 2] += column
-            for d_row, d_column in ((0, 1), (1, 0), (0, -1), (-1, 0)):
-                r, c = row + d_row, column + d_column
-                if r >= 0 and c >= 0 and r < height and c < width and behind[r, c] > 0:
-                    hidden[b] = max(hidden[b], float(sizes[behind[r, c] - 1]))
-
-
-@njit
-def block_places(
-    free_space: NDArray[np.bool_], block: NDArray[np.int32], sums: NDArray[np.float64], reach: int
-) -> NDArray[np.int64]:
-    """For each block the free-space cell that is nearest to its middle and near to one of its cells; -1 if none.
-
-    reach: a free-space cell within so many cells (Chebyshev) of a cell of the block counts.
-    """
-    height, width = block.shape
-    places = np.full((sums.shape[0], 2), -1, np.int64)
-    best = np.full(sums.shape[0], np.inf)
-    for row in range(height):
-        for column in range(width):
-            b = block[row, column]
-            if b < 0:
-                continue
-            mid_row, mid_column = sums[b, 1] / sums[b, 0], sums[b, 2] / sums[b, 0]
-            near = 0 if free_space[row, column] else reach
-            for r in range(max(0, row - near), min(height, row + near + 1)):
-                for c in range(max(0, column - near), min(width, column + near + 1)):
-                    if not free_space[r, c]:
-                        continue
-                    off = (r - row) ** 2 + (c - column) ** 2
-                    score = (r - mid_row) ** 2 + (c - mid_column) ** 2 + 4.0 * off
-                    if score < best[b]:
-                        best[b] = score
-                        places[b, 0], places[b, 1] = r, c
-    return places
+    return window.spec.contains(*window.cell(frontier.x_m, frontier.y_m))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from planning.frames import Planar
-from planning.grid import GridSpec
+from planning.grid import UNKNOWN
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.operation import MissionPhase
@@ -33,12 +33,16 @@ from schemas.topics import (
     STATUS_GRAPH_REQUEST,
 )
 from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GridHeader, RiskMap
+from services.irm.areas import Areas
 from services.irm.config import Config
 from services.irm.footprints import FootprintStore
+from services.irm.ground import GroundStore
+from services.irm.keyframes import Keyframes, OdomInMap, is_near
 from services.irm.local_irm import LocalIrmBuilder
+from services.irm.resample import moved
 from services.irm.roadmap import Roadmap
 from services.irm.tiles import TileLayer
-from services.irm.window import Window, build_window, window_picture
+from services.irm.window import Window, build_window, grid_of, read_layer, window_picture
 
 __all__ = ["Config", "IrmStage", "create", "spec"]
 
@@ -46,6 +50,7 @@ _BLOCKED_AGAIN_NS = 5 * SECOND_NS
 """Blocked at one place again after so long, it counts once more."""
 _MAX_PENDING = 50
 _PROGRESS_M2 = 0.3
+_SAME_M = 1e-6
 _SKIPPED_VERSIONS = 1000
 """More than the versions of the Local IRM that are given between two records."""
 
@@ -73,34 +78,38 @@ class IrmStage:
         self._ground: TileLayer | None = None
         self._coverage: TileLayer | None = None
         self._store: FootprintStore | None = None
+        self._ground_store: GroundStore | None = None
+        self._areas: Areas | None = None
         self._local: LocalIrmBuilder | None = None
         self._roadmap = Roadmap(config)
-        self._keyframes: dict[int, Planar] = {}
+        self._keyframes = Keyframes()
+        self._odom = OdomInMap()
+        self._moved = False
+        self._resumed = False
         self._pending: list[CoverageScan] = []
         self._penalties: list[tuple[int, float, float]] = []
         self._global_ns = -(10**18)
         self._covered_m2 = 0.0
-        self._window_spec: GridSpec | None = None
-        self._resumed = False
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One round of Algorithm 1; nothing while the risk map or the pose is missing or stale."""
         self._pending += [r.message for r in inputs.new(COVERAGE_SCAN)]
         self._pending = self._pending[-_MAX_PENDING:]
-        self._read_pose_graph(inputs)
         risk, odometry = inputs.current(RISK_MAP), inputs.current(ODOMETRY)
         if self._resumed and odometry is not None:
             # Before anything is changed: readers hear that what was acknowledged still stands.
             self._resumed = False
-            whole = self._roadmap.message(odometry.pose, odometry.map_to_odom, now, True)
+            whole = self._roadmap.message(odometry.pose, self._frame_pose(odometry), now, True)
+            self._read_pose_graph(inputs)
             return [Output(GLOBAL_IRM, whole)]
+        self._read_pose_graph(inputs)
         if risk is None or odometry is None:
             return []
         self._allocate(risk)
+        self._odom.update(planar(odometry.map_to_odom), now, len(self._keyframes) > 0)
         self._read_follower(now, inputs, odometry)
         self._add_scans(risk, odometry)
         window = self._window(risk, odometry, now)
-        self._window_spec = window.spec
         assert self._local is not None
         local = self._local.build(window, odometry.pose, odometry.map_to_odom, risk.stamp_ns)
         found: Outputs = [Output(LOCAL_IRM, local)]
@@ -118,22 +127,27 @@ class IrmStage:
             self._make_layers(risk.grid.resolution_m, risk.footprint_radius_m, 0)
 
     def _make_layers(self, resolution_m: float, radius_m: float, version: int) -> None:
+        p = self._config.covered_probability
         self._ground = TileLayer("uint8", 0, resolution_m)
         self._coverage = TileLayer("float32", 0.0, resolution_m)
         self._store = FootprintStore(self._coverage)
+        self._ground_store = GroundStore(self._ground)
+        self._areas = Areas(self._ground, self._coverage, math.log(p / (1.0 - p)))
         self._local = LocalIrmBuilder(self._config, radius_m, version)
 
     def _read_pose_graph(self, inputs: Inputs) -> None:
         received = inputs.latest(POSE_GRAPH)
         if received is None or not received.fresh:
             return
-        graph = received.message
-        self._keyframes = {
-            int(k): Planar(float(p[0]), float(p[1]), float(p[3]))
-            for k, p in zip(graph.keyframe_id, graph.pose_in_map, strict=True)
-        }
-        if self._store is not None:
-            self._store.follow(self._keyframes)
+        changed, motion = self._keyframes.read(received.message)
+        if not changed:
+            return
+        self._moved = True
+        self._odom.follow(motion)
+        self._roadmap.follow(changed)
+        if self._store is not None and self._ground_store is not None:
+            self._store.follow(changed)
+            self._ground_store.follow(changed)
 
     def _read_follower(self, now: Stamp, inputs: Inputs, odometry: Odometry) -> None:
         """Where the robot was blocked or stuck, the ground ahead is riskier than it looks."""
@@ -142,30 +156,46 @@ class IrmStage:
         follower = inputs.current(FOLLOWER)
         if follower is None or not (follower.blocked or follower.stuck):
             return
-        ahead = planar(odometry.map_to_odom).compose(planar(odometry.pose)).apply(0.5, 0.0)
+        ahead = planar(odometry.pose).apply(0.5, 0.0)
         lately = [p for p in self._penalties if now - p[0] < _BLOCKED_AGAIN_NS]
         if all(math.dist(ahead, p[1:]) > 0.3 for p in lately):  # again and again: worse and worse
             self._penalties.append((now, *ahead))
 
     def _add_scans(self, risk: RiskMap, odometry: Odometry) -> None:
         assert self._store is not None
-        g = risk.grid
-        grid = GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
         waiting = []
         for scan in self._pending:
-            keyframe = self._keyframes.get(scan.keyframe_id)
+            keyframe = self._keyframes.pose(scan.keyframe_id)
             if keyframe is None:
                 waiting.append(scan)
                 continue
-            self._store.add(scan, keyframe, risk.state, grid, planar(odometry.map_to_odom))
+            self._store.add(scan, keyframe, risk.state, grid_of(risk), self._frame_of(scan, keyframe))
         self._pending = waiting
 
+    def _frame_of(self, scan: CoverageScan, keyframe: Planar) -> Planar:
+        """Pose of `odom` in `map` by the keyframe of a scan: right also when a closure came in between."""
+        in_map = keyframe.compose(planar(scan.pose_in_keyframe))
+        frame = in_map.compose(planar(scan.pose_in_odom).inverse())
+        return self._odom.pose if is_near(frame, self._odom.pose, _SAME_M, _SAME_M) else frame
+
     def _window(self, risk: RiskMap, odometry: Odometry, now: Stamp) -> Window:
-        assert self._ground is not None and self._coverage is not None
-        return build_window(
-            risk, odometry.pose.x_m, odometry.pose.y_m, self._config, self._ground, self._coverage,
-            [(x, y) for _, x, y in self._penalties],
+        assert self._ground and self._coverage and self._ground_store and self._store
+        frame, spec = self._odom.pose, grid_of(risk)
+        anchor = self._keyframes.reference(*self._place(odometry)[:2])
+        deviations_m = self._keyframes.deviations_m(anchor, 0.5 * spec.width * spec.resolution_m)
+        self._store.blur(deviations_m, self._config.blur_from_m)
+        known = read_layer(self._ground, spec, frame)
+        window = build_window(
+            risk, odometry.pose.x_m, odometry.pose.y_m, self._config, known,
+            read_layer(self._coverage, spec, frame), [(x, y) for _, x, y in self._penalties], frame,
+            odometry.map_to_odom.z_m,
         )  # fmt: skip
+        self._ground_store.write(spec, np.where(risk.state != UNKNOWN, known, np.uint8(0)), frame, anchor)
+        return window
+
+    def _place(self, odometry: Odometry) -> Planar:
+        """The robot in `map`."""
+        return self._odom.pose.compose(planar(odometry.pose))
 
     def _global(
         self,
@@ -182,23 +212,32 @@ class IrmStage:
             min(since, 2.0 * self._config.global_period_s) if self._global_ns >= 0 and exploring else 0.0
         )
         self._global_ns = now
-        place = planar(odometry.map_to_odom).compose(planar(odometry.pose))
-        ground_m2, covered_m2 = self._areas()
+        place = self._place(odometry)
+        anchor = self._keyframes.reference(place.x_m, place.y_m)
+        assert self._areas is not None
+        ground_m2, covered_m2 = self._areas.update()
+        if self._moved:  # what a closure has changed of the area is neither progress nor the lack of it
+            self._covered_m2, self._moved = covered_m2, False
         if covered_m2 >= self._covered_m2 + _PROGRESS_M2:
             self._covered_m2 = covered_m2
             self._roadmap.manager.progressed()
         if policy is not None:
             self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, elapsed)
-        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, ground_m2)
+        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, ground_m2, anchor)
         first = self._roadmap.version == 0
-        message = self._roadmap.message(odometry.pose, odometry.map_to_odom, now, whole or first)
-        s = window.spec
+        message = self._roadmap.message(odometry.pose, self._frame_pose(odometry), now, whole or first)
+        s, picture = moved(window.spec, window_picture(window), window.frame)
         header = GridHeader(resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, width=s.width, height=s.height)
         return [
             Output(GLOBAL_IRM, message),
             Output(COVERAGE, self._summary(now, ground_m2, covered_m2)),
-            Output(COVERAGE_WINDOW, CoverageWindow(stamp_ns=now, grid=header, cell=window_picture(window))),
+            Output(COVERAGE_WINDOW, CoverageWindow(stamp_ns=now, grid=header, cell=picture)),
         ]
+
+    def _frame_pose(self, odometry: Odometry) -> Pose:
+        """Pose of `odom` in `map` that the graph goes by."""
+        frame, told = self._odom.pose, odometry.map_to_odom
+        return told.model_copy(update={"x_m": frame.x_m, "y_m": frame.y_m, "yaw_rad": frame.yaw_rad})
 
     def _summary(self, now: Stamp, reachable: float, covered: float) -> CoverageSummary:
         given_up = self._roadmap.manager.given_up
@@ -209,7 +248,7 @@ class IrmStage:
             reachable_area_m2=reachable,
             covered_area_m2=covered,
             covered_fraction=covered / reachable if reachable else 0.0,
-            entropy_left=float(sum(f.gain for f in frontiers.values())),
+            entropy_left=float(sum(f.gain for f in frontiers.values())) + self._roadmap.manager.dropped_gain,
             frontiers=len(frontiers),
             frontier_gain=float(sum(f.gain for f in frontiers.values())),
             breadcrumbs=self._roadmap.breadcrumbs(),
@@ -219,26 +258,12 @@ class IrmStage:
             unreachable_reason=[g.reason for g in given_up],
         )
 
-    def _areas(self) -> tuple[float, float]:
-        """(reachable, covered) ground in m2, over everything seen so far."""
-        assert self._ground is not None and self._coverage is not None
-        p = self._config.covered_probability
-        bound = math.log(p / (1.0 - p))
-        reachable, covered = 0, 0
-        looked = dict(self._coverage.tiles())
-        for key, ground in self._ground.tiles():
-            mask = ground == 1
-            reachable += int(mask.sum())
-            if key in looked:
-                covered += int((mask & (looked[key] >= bound)).sum())
-        area = self._ground.resolution_m**2
-        return reachable * area, covered * area
-
     def snapshot(self) -> bytes:
         """The whole belief."""
         state = {
             "roadmap": self._roadmap.state(),
-            "keyframes": [[k, *p] for k, p in sorted(self._keyframes.items())],
+            "keyframes": self._keyframes.state(),
+            "odom": [*self._odom.state(), self._moved],
             "penalties": self._penalties,
             "pending": [scan.model_dump() for scan in self._pending],
             "anchors": self._local.state() if self._local else [],
@@ -250,6 +275,7 @@ class IrmStage:
             "ground": self._ground.state() if self._ground else {},
             "coverage": self._coverage.state() if self._coverage else {},
             "footprints": self._store.state() if self._store else {},
+            "patches": self._ground_store.state() if self._ground_store else {},
         }
         return pack_snapshot(state)
 
@@ -257,22 +283,25 @@ class IrmStage:
         """Go on from a snapshot."""
         state = unpack_snapshot(snapshot)
         self._roadmap.set_state(state["roadmap"])
-        self._keyframes = {int(k): Planar(x, y, yaw) for k, x, y, yaw in state["keyframes"]}
+        self._keyframes.set_state(state["keyframes"])
+        *odom, self._moved = state["odom"]
+        self._odom.set_state(odom)
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
         self._pending = [CoverageScan(**scan) for scan in state["pending"]]
         self._global_ns = state["global_ns"]
         self._covered_m2 = state["covered_m2"]
         if state["resolution"]:
             self._make_layers(state["resolution"], state["radius"], state["version"])
-            assert self._ground and self._coverage and self._store and self._local
+            assert self._ground and self._coverage and self._store and self._ground_store and self._local
             self._ground.set_state(state["ground"])
             self._coverage.set_state(state["coverage"])
             self._store.set_state(state["footprints"])
+            self._ground_store.set_state(state["patches"])
             self._local.set_state(state["anchors"])
 
     def journal(self, outputs: Outputs) -> bytes:
         """What the Global IRM and the coverage in `outputs` tell: the graph's difference, footprints and ground."""
-        assert self._ground and self._store and self._local
+        assert self._ground_store and self._ground and self._store and self._local
         record: dict[str, Any] = {
             "graph": [
                 self._roadmap.difference(output.message)
@@ -280,6 +309,9 @@ class IrmStage:
                 if isinstance(output.message, GlobalIrm)
             ],
             "footprints": self._store.take_changes(),
+            "ground": self._ground_store.take_changes(),
+            "keyframes": self._keyframes.take_changes(),
+            "odom": [*self._odom.state(), self._moved],
             "resolution": self._ground.resolution_m,
             "radius": self._local.footprint_radius_m,
             "version": self._local.version,
@@ -287,9 +319,6 @@ class IrmStage:
             "covered_m2": self._covered_m2,
             "penalties": self._penalties,
         }
-        if self._window_spec is not None:
-            record["spec"] = list(self._window_spec)
-            record["ground"] = self._ground.read(self._window_spec)
         return zlib.compress(pack_snapshot(record), 1)
 
     def replay(self, record: bytes) -> None:
@@ -297,12 +326,14 @@ class IrmStage:
         state = unpack_snapshot(zlib.decompress(record))
         if self._ground is None:
             self._make_layers(state["resolution"], state["radius"], state["version"])
-        assert self._ground and self._store and self._local
+        assert self._ground_store and self._store and self._local
         for difference in state["graph"]:
             self._roadmap.apply_difference(difference)
         self._store.apply_changes(state["footprints"])
-        if "spec" in state:
-            self._ground.write(GridSpec(*state["spec"]), state["ground"])
+        self._ground_store.apply_changes(state["ground"])
+        self._keyframes.apply_changes(state["keyframes"])
+        *odom, self._moved = state["odom"]
+        self._odom.set_state(odom)
         self._local.version = state["version"]
         self._global_ns, self._covered_m2 = state["global_ns"], state["covered_m2"]
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]

@@ -20,12 +20,13 @@ class TileLayer:
     def __init__(self, dtype: str, fill: float, resolution_m: float) -> None:
         self.dtype = np.dtype(dtype)
         self.resolution_m = resolution_m
-        self._fill = fill
+        self.fill = fill
         self._tiles: dict[tuple[int, int], NDArray[Any]] = {}
+        self._touched: set[tuple[int, int]] = set()
 
     def read(self, spec: GridSpec) -> NDArray[Any]:
         """A copy of the window, shape (height, width); the fill value where no tile is."""
-        out = np.full(spec.shape, self._fill, dtype=self.dtype)
+        out = np.full(spec.shape, self.fill, dtype=self.dtype)
         for key, of_tile, of_window in _pieces(spec):
             tile = self._tiles.get(key)
             if tile is not None:
@@ -38,10 +39,26 @@ class TileLayer:
             piece = values[of_window]
             tile = self._tiles.get(key)
             if tile is None:
-                if not np.any(piece != self._fill):
+                if not np.any(piece != self.fill):
                     continue
-                tile = self._tiles[key] = np.full((TILE, TILE), self._fill, dtype=self.dtype)
+                tile = self._tiles[key] = np.full((TILE, TILE), self.fill, dtype=self.dtype)
             tile[of_tile] = piece
+            self._touched.add(key)
+
+    def clear(self, keys: set[tuple[int, int]]) -> None:
+        """Forget all cells of these tiles."""
+        for key in keys & self._tiles.keys():
+            del self._tiles[key]
+            self._touched.add(key)
+
+    def tile(self, key: tuple[int, int]) -> NDArray[Any] | None:
+        """The cells of a tile; None where nothing was written."""
+        return self._tiles.get(key)
+
+    def take_touched(self) -> set[tuple[int, int]]:
+        """The tiles written or cleared since the last call."""
+        touched, self._touched = self._touched, set()
+        return touched
 
     def tiles(self) -> Iterator[tuple[tuple[int, int], NDArray[Any]]]:
         """(tile index (x, y), cells) in a fixed order."""
@@ -55,6 +72,7 @@ class TileLayer:
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot."""
         self._tiles = {(k[0], k[1]): t for k, t in zip(state["keys"], state["tiles"], strict=True)}
+        self._touched = set(self._tiles)
 
 
 def _pieces(spec: GridSpec) -> Iterator[tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,13 @@ from numpy.typing import NDArray
 from planning.clusters import flood_fill
 from planning.coverage import entropy, probability
 from planning.footprint import footprint_hazard
+from planning.frames import Planar
 from planning.grid import FREE, LETHAL, UNKNOWN, GridSpec
 from planning.kernels import njit
 from schemas.world import RiskMap
 from services.irm.config import Config
+from services.irm.keyframes import IDENTITY
+from services.irm.resample import bounds, resample
 from services.irm.tiles import TileLayer
 
 KNOWN, GROUND = 2, 1
@@ -23,8 +27,9 @@ KNOWN, GROUND = 2, 1
 
 @dataclass(slots=True)
 class Window:
-    """What is known around the robot, all (h, w) over `spec` in `map`.
+    """What is known around the robot, all (h, w) over `spec` in `odom`, in which nothing jumps.
 
+    frame: pose of `odom` in `map`, frame_z_m: its height; roadmaps are in `map`, hence `cell` and `to_map`.
     hopeful: never seen (not only forgotten by the risk map), but the robot's centre may fit there and get there, as
     far as obstacles are known. free_space: its centre fits, and gets there over known ground; reachable: or over
     forgotten ground. ground: what its body can touch from there. uncovered: ground below the covered
@@ -45,6 +50,44 @@ class Window:
     probability: NDArray[np.float32]
     entropy: NDArray[np.float32]
     robot_cell: tuple[int, int]
+    elevation_m: NDArray[np.float32]
+    frame: Planar = IDENTITY
+    frame_z_m: float = 0.0
+    _from_map: Planar = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._from_map = self.frame.inverse()
+
+    def cell(self, x_m: float, y_m: float) -> tuple[int, int]:
+        """(row, column) of a point in `map`; may lie outside."""
+        if not self.frame.is_identity:
+            x_m, y_m = self._from_map.apply(x_m, y_m)
+        return self.spec.cell_of(x_m, y_m)
+
+    def to_map(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """A point of `odom` in `map`."""
+        return (x_m, y_m) if self.frame.is_identity else self.frame.apply(x_m, y_m)
+
+    def height_m(self, x_m: float, y_m: float) -> float | None:
+        """Height in `map` of the ground at a point in `map`; None where the risk map does not know it."""
+        row, column = self.cell(x_m, y_m)
+        if not self.spec.contains(row, column) or self.state[row, column] == UNKNOWN:
+            return None
+        return float(self.elevation_m[row, column]) + self.frame_z_m
+
+
+def grid_of(risk: RiskMap) -> GridSpec:
+    """Where a risk map lies, in `odom`."""
+    g = risk.grid
+    return GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
+
+
+def read_layer(layer: TileLayer, spec: GridSpec, frame: Planar) -> NDArray[Any]:
+    """A layer in `map` as it lies in a window in `odom`, (h, w). frame: pose of `odom` in `map`."""
+    if frame.is_identity:
+        return layer.read(spec)
+    there = bounds(spec, frame)
+    return resample(layer.read(there), there, spec, frame.inverse(), layer.fill)
 
 
 def build_window(
@@ -52,17 +95,20 @@ def build_window(
     x_m: float,
     y_m: float,
     config: Config,
-    ground_layer: TileLayer,
-    coverage_layer: TileLayer,
+    layer: NDArray[np.uint8],
+    log_odds: NDArray[np.float32],
     penalties: list[tuple[float, float]],
+    frame: Planar = IDENTITY,
+    frame_z_m: float = 0.0,
 ) -> Window:
-    """The layers around the robot from a risk map and what was known before; updates the ground layer.
+    """The layers around the robot from a risk map and what was known before.
 
-    penalties: places (x, y) where the robot was blocked lately; their hazard is raised.
+    x_m, y_m: the robot in `odom`. layer: what was known of the ground, over the risk map's grid; brought up to date
+    in place. log_odds: of coverage. penalties: places (x, y) in `odom` where the robot was blocked lately; their
+    hazard is raised.
     """
+    spec = grid_of(risk)
     g = risk.grid
-    spec = GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
-    layer = ground_layer.read(spec)
     before = layer == GROUND
     hazard = footprint_hazard(
         risk.hazard_cvar, risk.footprint_radius_m + config.hazard_margin_m, g.resolution_m
@@ -84,11 +130,10 @@ def build_window(
     ground |= forgotten
     layer[risk.state != UNKNOWN] = KNOWN
     layer[ground] = GROUND
-    ground_layer.write(spec, layer)
     unseen = layer == 0
     hopeful = solid(unseen) & (risk.clearance_m >= needed)
     hopeful &= connected_free_space(reachable | hopeful, robot)
-    p = probability(coverage_layer.read(spec))
+    p = probability(log_odds)
     uncovered = without_slivers(ground & (p < config.covered_probability))
     cell_share = (g.resolution_m / config.spacing_m) ** 2
     cell_entropy = np.where(uncovered, entropy(p) * np.float32(cell_share), np.float32(0.0))
@@ -106,6 +151,9 @@ def build_window(
         probability=p,
         entropy=cell_entropy,
         robot_cell=robot,
+        elevation_m=risk.elevation_m,
+        frame=frame,
+        frame_z_m=frame_z_m,
     )
 
 

@@ -14,7 +14,8 @@ from planning.coverage import look_log_odds, probability
 from planning.frames import Planar
 from planning.grid import FREE, LETHAL, UNKNOWN, GridSpec
 from schemas.snapshot import pack_snapshot, unpack_snapshot
-from services.irm.footprints import FootprintStore, resample
+from services.irm.footprints import FootprintStore
+from services.irm.resample import resample
 from services.irm.tiles import TileLayer
 from tests.irm.worlds import DETECTION, scan_at
 

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from planning.coverage import LOG_2
 from planning.grid import FREE, LETHAL, UNKNOWN
 from schemas.snapshot import pack_snapshot, unpack_snapshot
+from services.irm.borders import Found, beside, find_frontiers, least_gain
 from services.irm.config import Config
-from services.irm.frontiers import Found, Frontier, FrontierManager, beside, find_frontiers, least_gain
+from services.irm.frontiers import Frontier, FrontierManager
 from services.irm.window import Window, solid
 from tests.irm.worlds import Belief, room
 

@@ -15,15 +15,9 @@ from planning.clusters import label_components
 from planning.coverage import LOG_2
 from planning.grid import FREE, LETHAL, UNKNOWN, GridSpec
 from schemas.snapshot import pack_snapshot, unpack_snapshot
+from services.irm.borders import block_gains, block_places, find_frontiers, mark_borders, spread_blocks
 from services.irm.config import Config
-from services.irm.frontiers import (
-    FrontierManager,
-    block_gains,
-    block_places,
-    find_frontiers,
-    mark_borders,
-    spread_blocks,
-)
+from services.irm.frontiers import FrontierManager
 from services.irm.window import Window
 from tests.irm.worlds import Belief, Flat, cluttered, room
 
@@ -73,6 +67,7 @@ def random_window(seed: int) -> Window:
         probability=zeros,
         entropy=entropy,
         robot_cell=(int(rng.integers(0, 21)), int(rng.integers(0, 26))),
+        elevation_m=zeros,
     )
 
 

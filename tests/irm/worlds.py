@@ -17,7 +17,7 @@ from schemas.world import GridHeader, RiskMap
 from services.irm.config import Config
 from services.irm.footprints import FootprintStore
 from services.irm.tiles import TileLayer
-from services.irm.window import Window, build_window
+from services.irm.window import Window, build_window, grid_of
 
 RADIUS_M = 0.25
 DETECTION = 0.95
@@ -120,7 +120,11 @@ class Belief:
         self, risk: RiskMap, x_m: float, y_m: float, penalties: list[tuple[float, float]] | None = None
     ) -> Window:
         """The layers around the robot."""
-        return build_window(risk, x_m, y_m, self.config, self.ground, self.coverage, penalties or [])
+        spec = grid_of(risk)
+        known, log_odds = self.ground.read(spec), self.coverage.read(spec)
+        window = build_window(risk, x_m, y_m, self.config, known, log_odds, penalties or [])
+        self.ground.write(spec, known)
+        return window
 
     def cover(self, spec: GridSpec, cells: NDArray[np.bool_]) -> None:
         """Mark cells as seen once."""

@@ -1,0 +1,259 @@
+"""The border of covered and uncovered traversable ground in one window: places and gains (Keidar and Kaminka 2012)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.clusters import component_centroids, label_components
+from planning.coverage import LOG_2
+from planning.grid import FREE
+from planning.kernels import njit
+from services.irm.config import Config
+from services.irm.window import Window
+
+
+class Found(NamedTuple):
+    """A frontier as it is found in a window, its place in `map`.
+
+    opening: mostly for what may lie behind the edge of the unseen.
+    """
+
+    x_m: float
+    y_m: float
+    gain: float
+    opening: bool
+
+
+def least_gain(config: Config, ground_m2: float) -> float:
+    """The gain from which a border is a frontier: a share of the ground known, within the two bounds, nats."""
+    share = config.frontier_min_share * ground_m2 / config.spacing_m**2 * LOG_2
+    return max(config.frontier_min_gain, min(share, config.frontier_enough_gain))
+
+
+def find_frontiers(window: Window, config: Config, least: float | None = None) -> list[Found]:
+    """The frontiers of a window with at least this gain, in a fixed order.
+
+    The uncovered ground is split into connected pieces; the border of a piece with covered ground is cut into blocks
+    snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Where the
+    robot's centre can get to the border of ground never seen that it may well enter (the way around a corner; not a
+    gap in a ragged wall that its body does not fit), that is open too, and counts what ground may lie behind.
+    """
+    s = window.spec
+    labels = np.zeros(s.shape, np.int32)
+    openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
+    openings &= near_robot(window, config.opening_range_m)
+    open_ground = window.uncovered | openings
+    pieces = label_components(open_ground, labels)
+    if pieces == 0:
+        return []
+    block = np.full(s.shape, -1, np.int32)
+    cells = max(1, round(config.frontier_block_m / s.resolution_m))
+    covered = window.ground & ~open_ground
+    blocks = mark_borders(open_ground, covered, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block)
+    if blocks == 0:
+        return []
+    reach = round(config.frontier_reach_m / s.resolution_m)
+    spread_blocks(open_ground, block, reach, blocks)
+    behind = np.zeros(s.shape, np.int32)
+    sizes = component_centroids(behind, label_components(window.hopeful, behind))[0]
+    gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
+    block_gains(window.entropy, behind, sizes, block, gain, sums, hidden)
+    hidden *= s.resolution_m**2
+    gain += np.minimum(hidden * LOG_2 / config.spacing_m**2, config.unknown_max_gain)
+    places = block_places(window.reachable, block, sums, round(1.0 / s.resolution_m))
+    piece_of = np.zeros(blocks, np.int64)
+    inside = block >= 0
+    piece_of[block[inside]] = labels[inside]
+    least = config.frontier_min_gain if least is None else least
+    opening = hidden >= config.opening_min_m2 - 1e-9
+    # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
+    gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
+    return _select(gain, opening, places, piece_of, window, least)
+
+
+def near_robot(window: Window, range_m: float) -> NDArray[np.bool_]:
+    """Cells within a distance of the robot's cell."""
+    rows = np.arange(window.spec.height) - window.robot_cell[0]
+    columns = np.arange(window.spec.width) - window.robot_cell[1]
+    near: NDArray[np.bool_] = (
+        rows[:, None] ** 2 + columns[None, :] ** 2 <= (range_m / window.spec.resolution_m) ** 2
+    )
+    return near
+
+
+def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells with a side in common with a cell of the mask."""
+    padded = np.pad(mask, 1)
+    near: NDArray[np.bool_] = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
+    return near
+
+
+def _select(
+    gain: NDArray[np.float64],
+    opening: NDArray[np.bool_],
+    places: NDArray[np.int64],
+    piece_of: NDArray[np.int64],
+    window: Window,
+    least: float,
+) -> list[Found]:
+    """Blocks with enough gain; of a piece of many small blocks that is worth it as a whole, its best block."""
+    found = []
+    total = np.bincount(piece_of, weights=gain, minlength=int(piece_of.max()) + 1)
+    best: dict[int, int] = {}
+    for index in range(len(gain)):
+        piece = int(piece_of[index])
+        if piece not in best or gain[index] > gain[best[piece]]:
+            best[piece] = index
+    for index in range(len(gain)):
+        piece = int(piece_of[index])
+        alone = gain[index] >= least
+        together = best[piece] == index and total[piece] >= least
+        if places[index, 0] >= 0 and (alone or together):
+            x, y = window.to_map(*window.spec.centre_of(int(places[index, 0]), int(places[index, 1])))
+            found.append(Found(x, y, float(gain[index] if alone else total[piece]), bool(opening[index])))
+    return found
+
+
+@njit
+def mark_borders(
+    uncovered: NDArray[np.bool_],
+    covered: NDArray[np.bool_],
+    labels: NDArray[np.int32],
+    ix0: int,
+    iy0: int,
+    cells: int,
+    pieces: int,
+    robot: tuple[int, int],
+    block: NDArray[np.int32],
+) -> int:
+    """Number the border cells by (piece, snapped block); a piece without a border gets its cell nearest the robot.
+
+    labels: (h, w), 0 outside, 1..pieces. block: out, -1 elsewhere. Returns how many blocks there are.
+    """
+    height, width = uncovered.shape
+    bx0, by0 = ix0 // cells, iy0 // cells
+    across = (ix0 + width) // cells - bx0 + 1
+    down = (iy0 + height) // cells - by0 + 1
+    number = np.full((pieces + 1) * across * down, -1, np.int32)
+    has_border = np.zeros(pieces + 1, np.bool_)
+    nearest = np.full(pieces + 1, -1, np.int64)
+    nearest_distance = np.full(pieces + 1, np.inf)
+    blocks = 0
+    for row in range(height):
+        for column in range(width):
+            if not uncovered[row, column]:
+                continue
+            piece = labels[row, column]
+            distance = float((row - robot[0]) ** 2 + (column - robot[1]) ** 2)
+            if distance < nearest_distance[piece]:
+                nearest_distance[piece], nearest[piece] = distance, row * width + column
+            border = False
+            for r in range(max(0, row - 1), min(height, row + 2)):
+                for c in range(max(0, column - 1), min(width, column + 2)):
+                    border = border or covered[r, c]
+            if not border:
+                continue
+            has_border[piece] = True
+            key = (piece * down + (iy0 + row) // cells - by0) * across + (ix0 + column) // cells - bx0
+            if number[key] < 0:
+                number[key] = blocks
+                blocks += 1
+            block[row, column] = number[key]
+    for piece in range(1, pieces + 1):
+        if not has_border[piece] and nearest[piece] >= 0:
+            block[nearest[piece] // width, nearest[piece] % width] = blocks
+            blocks += 1
+    return blocks
+
+
+@njit
+def spread_blocks(uncovered: NDArray[np.bool_], block: NDArray[np.int32], reach: int, blocks: int) -> None:
+    """Breadth-first: each uncovered cell takes the number of the block that gets to it first, within `reach` steps.
+
+    block: (h, w), changed in place; cells that the border gave keep their number.
+    """
+    height, width = uncovered.shape
+    queue = np.empty(height * width, np.int64)
+    depth = np.zeros((height, width), np.int32)
+    head, tail = 0, 0
+    for row in range(height):
+        for column in range(width):
+            if block[row, column] >= 0:
+                queue[tail] = row * width + column
+                tail += 1
+    while head < tail:
+        row, column = queue[head] // width, queue[head] % width
+        head += 1
+        if depth[row, column] >= reach:
+            continue
+        for r in range(max(0, row - 1), min(height, row + 2)):
+            for c in range(max(0, column - 1), min(width, column + 2)):
+                if uncovered[r, c] and block[r, c] < 0:
+                    block[r, c] = block[row, column]
+                    depth[r, c] = depth[row, column] + 1
+                    queue[tail] = r * width + c
+                    tail += 1
+
+
+@njit
+def block_gains(
+    entropy: NDArray[np.float32],
+    behind: NDArray[np.int32],
+    sizes: NDArray[np.int64],
+    block: NDArray[np.int32],
+    gain: NDArray[np.float64],
+    sums: NDArray[np.float64],
+    hidden: NDArray[np.float64],
+) -> None:
+    """Entropy of each block's cells, and the size of the largest piece of hopeful ground that they border on (hidden).
+
+    behind: (h, w) labels of the pieces of hopeful ground, 0 elsewhere. sizes: cells of piece k + 1. sums: (blocks, 3):
+    number of cells, sum of rows, sum of columns.
+    """
+    height, width = block.shape
+    for row in range(height):
+        for column in range(width):
+            b = block[row, column]
+            if b < 0:
+                continue
+            gain[b] += entropy[row, column]
+            sums[b, 0] += 1.0
+            sums[b, 1] += row
+            sums[b, 2] += column
+            for d_row, d_column in ((0, 1), (1, 0), (0, -1), (-1, 0)):
+                r, c = row + d_row, column + d_column
+                if r >= 0 and c >= 0 and r < height and c < width and behind[r, c] > 0:
+                    hidden[b] = max(hidden[b], float(sizes[behind[r, c] - 1]))
+
+
+@njit
+def block_places(
+    free_space: NDArray[np.bool_], block: NDArray[np.int32], sums: NDArray[np.float64], reach: int
+) -> NDArray[np.int64]:
+    """For each block the free-space cell that is nearest to its middle and near to one of its cells; -1 if none.
+
+    reach: a free-space cell within so many cells (Chebyshev) of a cell of the block counts.
+    """
+    height, width = block.shape
+    places = np.full((sums.shape[0], 2), -1, np.int64)
+    best = np.full(sums.shape[0], np.inf)
+    for row in range(height):
+        for column in range(width):
+            b = block[row, column]
+            if b < 0:
+                continue
+            mid_row, mid_column = sums[b, 1] / sums[b, 0], sums[b, 2] / sums[b, 0]
+            near = 0 if free_space[row, column] else reach
+            for r in range(max(0, row - near), min(height, row + near + 1)):
+                for c in range(max(0, column - near), min(width, column + near + 1)):
+                    if not free_space[r, c]:
+                        continue
+                    off = (r - row) ** 2 + (c - column) ** 2
+                    score = (r - mid_row) ** 2 + (c - mid_column) ** 2 + 4.0 * off
+                    if score < best[b]:
+                        best[b] = score
+                        places[b, 0], places[b, 1] = r, c
+    return places

@@ -1,0 +1,95 @@
+"""Ways over the fine layers around the robot: what the edges of the Global IRM are made of."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planning.grid import LETHAL
+from planning.kernels import njit
+from planning.search import dijkstra_box
+from services.irm.window import Window
+
+_NO_TARGETS = np.empty((0, 2), np.int32)
+
+
+class Search:
+    """Distances and risks from one cell over the window, to points in `map`."""
+
+    def __init__(self, window: Window) -> None:
+        self._window = window
+        self._cost = np.full(window.spec.shape, np.inf)
+        self._parent = np.full(window.spec.shape, -1, np.int32)
+
+    def run(self, start: tuple[int, int], reach_m: float) -> None:
+        """Search from a cell, up to `reach_m` away (straight)."""
+        w = self._window
+        row, column = start
+        if not w.spec.contains(row, column):
+            return
+        cells = math.ceil(reach_m / w.spec.resolution_m)
+        box = (row - cells, row + cells + 1, column - cells, column + cells + 1)
+        dijkstra_box(
+            w.step_cost, w.free_space, w.spec.resolution_m, row, column, box, _NO_TARGETS, 4.0 * reach_m,
+            self._cost, self._parent,
+        )  # fmt: skip
+
+    def to(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """(distance, rho) of the best path to a point; (inf, 1) when there is none."""
+        cell = self._nearest_reached(x_m, y_m)
+        if cell is None:
+            return math.inf, 1.0
+        s = self._window.spec
+        distance, integral = path_totals(self._parent, self._window.hazard, s.resolution_m, cell[0], cell[1])
+        return distance, 1.0 - math.exp(-integral)
+
+    def knows(self, x_m: float, y_m: float) -> bool:
+        """Whether the point lies in the window on known ground, so that 'no path' is evidence."""
+        row, column = self._window.cell(x_m, y_m)
+        return self._window.spec.contains(row, column) and self._window.state[row, column] != 0
+
+    def obstacle_between(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
+        """Whether a lethal cell lies on the straight line between two points."""
+        spec, state = self._window.spec, self._window.state
+        steps = max(1, math.ceil(2.0 * math.dist(a, b) / spec.resolution_m))
+        for i in range(steps + 1):
+            at = (a[0] + (b[0] - a[0]) * i / steps, a[1] + (b[1] - a[1]) * i / steps)
+            row, column = self._window.cell(*at)
+            if spec.contains(row, column) and state[row, column] == LETHAL:
+                return True
+        return False
+
+    def _nearest_reached(self, x_m: float, y_m: float) -> tuple[int, int] | None:
+        row, column = self._window.cell(x_m, y_m)
+        height, width = self._cost.shape
+        for reach in (0, 1, 2, 4):
+            r0, r1 = max(0, row - reach), min(height, row + reach + 1)
+            c0, c1 = max(0, column - reach), min(width, column + reach + 1)
+            if r0 >= r1 or c0 >= c1:
+                continue
+            piece = self._cost[r0:r1, c0:c1]
+            if np.isfinite(piece).any():
+                index = int(np.argmin(piece))
+                return r0 + index // piece.shape[1], c0 + index % piece.shape[1]
+        return None
+
+
+@njit
+def path_totals(
+    parent: NDArray[np.int32], hazard: NDArray[np.float32], resolution_m: float, row: int, column: int
+) -> tuple[float, float]:
+    """Length and hazard integral of the path to a cell, along the parents of a grid search."""
+    width = parent.shape[1]
+    distance, integral = 0.0, 0.0
+    at = row * width + column
+    while parent[at // width, at % width] >= 0:
+        before = parent[at // width, at % width]
+        diagonal = at // width != before // width and at % width != before % width
+        step = resolution_m * (1.4142135623730951 if diagonal else 1.0)
+        mean = 0.5 * (hazard[at // width, at % width] + hazard[before // width, before % width])
+        distance += step
+        integral += step * mean
+        at = before
+    return distance, integral
