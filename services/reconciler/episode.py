@@ -26,7 +26,6 @@ from schemas.world import LocalIrm
 from services.reconciler.config import Config
 from services.reconciler.path import Ground, headings
 
-
 _MOST_SPREAD = 0.05
 """Of a pose in `odom`, m and rad."""
 
