@@ -134,8 +134,8 @@ class FootprintStore:
         deviations_m: standard deviation by keyframe, of those around the robot; the others keep their level.
         Returns how many changed.
         """
-        if from_m <= 0.0:
-            return 0
+        if not deviations_m:  # nothing is uncertain any more
+            deviations_m = dict.fromkeys(self._blurred, 0.0)
         levels = {
             k: blur_level(d, from_m) for k, d in deviations_m.items() if d > from_m or k in self._blurred
         }

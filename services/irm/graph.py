@@ -122,12 +122,15 @@ class RoadGraph:
     def _crumbs_beside(self, node: int) -> list[int]:
         return [n for n in self.graph.neighbors(node) if self._is_crumb(n)]
 
-    def leads_to(self, frontier: int) -> bool:
-        """Whether a way leads from the robot to a frontier; no other frontier may lie on it."""
+    def components_of(self, node: int) -> set[int]:
+        """Which components of the breadcrumbs' graph a node is joined to, by numbers that hold until it changes."""
+        return {self._components.label(n) for n in self._crumbs_beside(node)}
+
+    def leads_to(self, frontier: int, components: set[int]) -> bool:
+        """Whether a way leads from the robot, in these components, to a frontier; no other frontier may lie on it."""
         if self.graph.has_edge(ROBOT, frontier):
             return True
-        mine = {self._components.label(n) for n in self._crumbs_beside(ROBOT)}
-        return any(self._components.label(n) in mine for n in self._crumbs_beside(frontier))
+        return any(self._components.label(n) in components for n in self.graph.neighbors(frontier))
 
     # --- what is told -----------------------------------------------------------------------------------------
 

@@ -47,6 +47,7 @@ class Keyframes:
         self._id = np.empty(0, np.int64)
         self._pose = np.empty((0, 3))
         self._variance_m2 = np.empty(0)
+        self._told = np.empty((0, 4))
         self._changed: set[int] = set()
 
     def __len__(self) -> int:
@@ -59,7 +60,14 @@ class Keyframes:
             The poses of the keyframes that moved (new ones did not move), and the motion in `map` of the newest of
             those known before, identity when it stayed.
         """
-        ids, poses = graph.keyframe_id, graph.pose_in_map[:, [0, 1, 3]]
+        ids, told, held = graph.keyframe_id, graph.pose_in_map, self._id.size
+        self._variance_m2 = graph.covariance[:, 0] + graph.covariance[:, 1]
+        if np.array_equal(ids[:held], self._id) and np.array_equal(told[:held], self._told):
+            self._changed.update(ids[held:].tolist())
+            self._pose = np.concatenate((self._pose, told[held:, [0, 1, 3]]))
+            self._id, self._told = ids, told
+            return {}, IDENTITY
+        poses = told[:, [0, 1, 3]]
         new, old = _common(ids, self._id)
         before, after = self._pose[old], poses[new]
         moved = _moved_rows(before, after)
@@ -71,8 +79,7 @@ class Keyframes:
         self._changed |= changed.keys()
         if new.size < ids.size:
             self._changed.update(np.delete(ids, new).tolist())
-        self._id, self._pose = ids, poses
-        self._variance_m2 = graph.covariance[:, :2].sum(axis=1)
+        self._id, self._pose, self._told = ids, poses, told
         return changed, motion
 
     def pose(self, keyframe: int) -> Planar | None:
@@ -89,13 +96,14 @@ class Keyframes:
         if not self._id.size:
             return Anchor()
         row = self._id.size - 1
-        away = np.hypot(self._pose[:, 0] - x_m, self._pose[:, 1] - y_m)
-        if away[row] > _NEWEST_WITHIN_M:
-            row = int(np.argmin(away))
+        if math.dist(self._pose[row, :2].tolist(), (x_m, y_m)) > _NEWEST_WITHIN_M:
+            row = int(np.argmin(np.hypot(self._pose[:, 0] - x_m, self._pose[:, 1] - y_m)))
         return Anchor(int(self._id[row]), _planar(self._pose[row]))
 
-    def deviations_m(self, anchor: Anchor, radius_m: float) -> dict[int, float]:
+    def deviations_m(self, anchor: Anchor, radius_m: float, least_m: float) -> dict[int, float]:
         """Standard deviation of the position *relative to* a keyframe, of the keyframes within a radius of it.
+
+        Empty when none anywhere has more than `least_m`.
 
         The difference of the marginal variances: exact along a chain of odometry, and none for keyframes that a
         closure ties to each other, whatever both have drifted from the start.
@@ -103,9 +111,12 @@ class Keyframes:
         row = self._row(anchor.keyframe)
         if row < 0:
             return {}
+        variance_m2 = np.abs(self._variance_m2 - self._variance_m2[row])
+        if float(variance_m2.max()) <= least_m**2:
+            return {}
         offset = self._pose[:, :2] - self._pose[row, :2]
         near = np.flatnonzero(np.hypot(offset[:, 0], offset[:, 1]) <= radius_m)
-        deviation = np.sqrt(np.abs(self._variance_m2[near] - self._variance_m2[row]))
+        deviation = np.sqrt(variance_m2[near])
         return dict(zip(self._id[near].tolist(), deviation.tolist(), strict=True))
 
     def _row(self, keyframe: int) -> int:
@@ -119,6 +130,7 @@ class Keyframes:
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot."""
         self._id, self._pose, self._variance_m2 = state["id"], state["pose"], state["variance"]
+        self._told = np.empty((0, 4))
 
     def take_changes(self) -> dict[str, Any]:
         """The keyframes that are new or have moved since the last call: for the journal."""
@@ -134,6 +146,7 @@ class Keyframes:
         self._id = ids[order]
         self._pose = np.concatenate((self._pose[kept], changes["pose"]))[order]
         self._variance_m2 = np.concatenate((self._variance_m2[kept], changes["variance"]))[order]
+        self._told = np.empty((0, 4))
 
 
 class OdomInMap:

@@ -239,9 +239,10 @@ class Roadmap:
 
     def _give_up_isolated(self, now_ns: int) -> None:
         """Frontiers that no way over the graph has led to for long cannot be planned for."""
+        components = self.road.components_of(ROBOT)
         for node in sorted(self.manager.frontiers):
             f = self.manager.frontiers[node]
-            f.isolated = 0 if self.road.leads_to(node) else f.isolated + 1
+            f.isolated = 0 if self.road.leads_to(node, components) else f.isolated + 1
             if f.isolated > 3 * self.config.missed_rounds:
                 self.manager.give_up(f, "no way over the graph", now_ns)
                 self.road.drop_node(node)

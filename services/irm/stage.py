@@ -182,8 +182,9 @@ class IrmStage:
         assert self._ground and self._coverage and self._ground_store and self._store
         frame, spec = self._odom.pose, grid_of(risk)
         anchor = self._keyframes.reference(*self._place(odometry)[:2])
-        deviations_m = self._keyframes.deviations_m(anchor, 0.5 * spec.width * spec.resolution_m)
-        self._store.blur(deviations_m, self._config.blur_from_m)
+        reach_m, from_m = 0.5 * spec.width * spec.resolution_m, self._config.blur_from_m
+        if from_m > 0.0:
+            self._store.blur(self._keyframes.deviations_m(anchor, reach_m, from_m), from_m)
         known = read_layer(self._ground, spec, frame)
         window = build_window(
             risk, odometry.pose.x_m, odometry.pose.y_m, self._config, known,

@@ -296,6 +296,39 @@ def test_a_snapshot_between_drift_and_closure_goes_on_alike() -> None:
     assert loops[0].frontiers() == loops[1].frontiers()
 
 
+def test_a_journal_across_a_closure_leads_to_the_same_belief() -> None:
+    loop = Loop(DRIFT)
+    loop.drive(20)
+    twin = IrmStage(CONFIG)
+    twin.restore(loop.stage.snapshot())
+    loop.stage.journal([])  # what the snapshot holds need not be told again
+    for closes in (False, False, True, False):
+        loop.step_count += 1
+        for _ in range(8):
+            if closes:
+                loop.close()
+                closes = False
+            found = loop.step()
+            loop.step_count += 1
+            twin.replay(loop.stage.journal(found))
+        loop.step_count -= 1
+    mine, theirs = loop.layers(), (twin._ground.read(WIDE), twin._coverage.read(WIDE))  # type: ignore[union-attr]
+    assert (mine[0] != theirs[0]).mean() < 1e-3
+    np.testing.assert_allclose(mine[1], theirs[1], atol=1e-4)
+    nodes = twin._roadmap.graph.nodes
+    assert {n: (d["x"], d["y"]) for n, d in loop.stage._roadmap.graph.nodes(data=True)} == {
+        n: (d["x"], d["y"]) for n, d in nodes(data=True)
+    }
+    assert twin._odom.pose == loop.stage._odom.pose
+    back = dict(loop.keyframes)
+    loop.close(exact=False)
+    for stage in (loop.stage, twin):
+        stage._read_pose_graph(inputs((POSE_GRAPH, pose_graph({**back, **loop.keyframes}))))
+    assert {n: d["x"] for n, d in nodes(data=True) if n != ROBOT} == pytest.approx(
+        {n: d["x"] for n, d in loop.stage._roadmap.graph.nodes(data=True) if n != ROBOT}
+    ), "keyframes that move while it is down move what belongs to them"
+
+
 def test_frontiers_out_of_the_window_move_with_the_keyframe_they_were_seen_from() -> None:
     loop = Loop(DRIFT)
     loop.drive(30)
