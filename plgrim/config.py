@@ -92,6 +92,10 @@ class RuntimeConfig(_Section):
     """Grace between SIGTERM and SIGKILL."""
 
 
+DEFAULT_PROFILE: Literal["spot"] = "spot"
+"""Also that of the services' own defaults."""
+
+
 class Config(BaseSettings):
     """Everything. The sections of services are checked by the service's own `Config`, loaded when asked for."""
 
@@ -99,7 +103,7 @@ class Config(BaseSettings):
 
     robot: str = Field("robot", pattern=r"^[A-Za-z0-9_-]{1,32}$")
     """Name of the robot: part of every key on the wire."""
-    profile: Literal["husky", "spot"] = "spot"
+    profile: Literal["husky", "spot"] = DEFAULT_PROFILE
     """The robot's body: what the simulator moves and what the planners take it for."""
     seed: int = Field(1, ge=0, lt=2**63)
     """The mission's seed; every random stream is derived from it."""
@@ -132,17 +136,22 @@ class Config(BaseSettings):
     def options(self, service: str) -> dict[str, Any]:
         """The section of a service, with what is said once for all: seed and robot profile; a section may differ.
 
-        In a simulated world of rough ground the risk map is one of terrain.
+        In a simulated world of rough ground the risk map is one of terrain, and the LiDAR looks down at it.
         """
         section: dict[str, Any] = dict(getattr(self, service))
+        rough, other = is_rough(self.sim), self.profile != DEFAULT_PROFILE
         if service == "sim":
             section.setdefault("seed", self.seed)
-            section["robot"] = {"profile": self.profile, **section.get("robot", {})}
-        elif service == "riskmap":
+            if other:
+                section["robot"] = {"profile": self.profile, **section.get("robot", {})}
+            if rough:
+                section.setdefault("lidar", dict(DOWNWARD_LIDAR))
+        elif service == "riskmap" and other:
             section.setdefault("profile", self.profile)
-            section.setdefault("model", "terrain" if is_rough(self.sim) else "flat")
-        elif service == "reconciler":
+        elif service == "reconciler" and other:
             section.setdefault("footprint_radius_m", PROFILES[self.profile].footprint_radius_m)
+        if service == "riskmap" and rough:
+            section.setdefault("model", "terrain")
         return section
 
 
@@ -152,6 +161,9 @@ def is_rough(sim: Mapping[str, Any]) -> bool:
         return False
     return bool(sim.get("mesh_file") or sim.get("dem_file")) or sim.get("world") in ROUGH_WORLDS
 
+
+DOWNWARD_LIDAR = {"rings": 24, "elevation_min_deg": -45.0, "elevation_max_deg": 15.0}
+"""For rough ground: with the default, no ring meets the ground nearer than 3 m, nor any way down at all."""
 
 ROUGH_WORLDS = ("cave", "lava_tube")
 """Built-in worlds whose ground is not flat."""

@@ -134,3 +134,34 @@ def test_every_service_config_of_ours_refuses_unknown_keys(monkeypatch: pytest.M
         if model is not None:
             with pytest.raises(ConfigError, match=f"{service}.no_such_key"):
                 check_keys({"no_such_key": 1}, model, "x", service)
+
+
+@pytest.mark.parametrize(("profile", "radius_m"), [("spot", 0.25), ("husky", 0.335)])
+def test_one_profile_for_the_simulator_and_all_planners(profile: str, radius_m: float) -> None:
+    from services.reconciler.config import Config as Reconciler
+    from services.riskmap.config import Config as RiskMap
+    from services.sim.config import SimConfig
+
+    config = load_config(None, {"profile": profile, "sim": {"world": "cave"}})
+    assert SimConfig.model_validate(config.options("sim")).robot.footprint_radius_m == radius_m
+    assert RiskMap.model_validate(config.options("riskmap")).footprint_radius_m == radius_m
+    assert Reconciler.model_validate(config.options("reconciler")).footprint_radius_m == radius_m
+
+
+@pytest.mark.parametrize(
+    ("sim", "model", "lowest_deg"),
+    [
+        ({"world": "cave"}, "terrain", -45.0),
+        ({"world": "maze"}, "flat", -15.0),
+        ({"mesh_file": "a"}, "terrain", -45.0),
+    ],
+)
+def test_rough_ground_gets_the_terrain_model_and_a_lidar_that_looks_down(
+    sim: dict[str, str], model: str, lowest_deg: float
+) -> None:
+    from services.riskmap.config import Config as RiskMap
+    from services.sim.config import SimConfig
+
+    config = load_config(None, {"sim": sim})
+    assert RiskMap.model_validate(config.options("riskmap")).model == model
+    assert SimConfig.model_validate(config.options("sim")).lidar.elevation_min_deg == lowest_deg
