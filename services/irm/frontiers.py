@@ -18,6 +18,10 @@ from services.irm.keyframes import NOBODY, Anchor
 from services.irm.spatial import SpatialHash
 from services.irm.window import Window
 
+CUT_OFF = "cut off: no way for the robot was found"
+ISOLATED = "no way over the graph"
+_NO_WAY = (CUT_OFF, ISOLATED)
+
 
 @dataclass(slots=True)
 class Frontier:
@@ -76,6 +80,7 @@ class FrontierManager:
     _changed: set[int] = field(default_factory=set)
     _pursued: set[int] = field(default_factory=set)
     _least: float = 0.0
+    _doubtful: frozenset[int] = frozenset()
 
     def update(
         self,
@@ -86,12 +91,15 @@ class FrontierManager:
         next_id: int,
         ground_m2: float = 0.0,
         anchor: Anchor = Anchor(),  # noqa: B008
+        doubtful: frozenset[int] = frozenset(),
     ) -> int:
         """Look at the window again. Returns the next id.
 
         robot: its place in `map`. elapsed_s: since the last call; ground_m2: known so far; anchor: the keyframe that
-        the robot is at.
+        the robot is at; doubtful: keyframes whose place relative to it is not known well. What belongs to them is not
+        in the window for certain, and is left as it is.
         """
+        self._doubtful = doubtful
         next_id = self._second_chances(next_id)
         self.given_up = [g for g in self.given_up if g.until_ns > now_ns]
         least = least_gain(self.config, ground_m2)
@@ -122,7 +130,8 @@ class FrontierManager:
         x, y = window.to_map(*s.centre_of(s.height // 2, s.width // 2))
         radius = 0.5 * math.hypot(s.height + 2, s.width + 2) * s.resolution_m
         around = (k for k in self._places.around(x, y, radius) if k in self.frontiers)
-        return [k for k in around if _in_window(window, self.frontiers[k])]
+        inside = [k for k in around if _in_window(window, self.frontiers[k])]
+        return [k for k in inside if self.frontiers[k].keyframe not in self._doubtful]
 
     def take_changes(self) -> set[int]:
         """Ids of the frontiers that are new, other than before or gone since the last call."""
@@ -131,6 +140,8 @@ class FrontierManager:
 
     def follow(self, keyframes: dict[int, Planar]) -> list[int]:
         """Move what belongs to keyframes that SLAM has moved. Returns the ids of the frontiers that moved."""
+        # A closure is news: what no way led to may have been a ghost of drift, or have a way now.
+        self.given_up = [g for g in self.given_up if g.keyframe not in keyframes or g.reason not in _NO_WAY]
         for g in self.given_up:
             if g.keyframe in keyframes:
                 g.x_m, g.y_m = keyframes[g.keyframe].apply(g.local_x_m, g.local_y_m)
@@ -219,7 +230,7 @@ class FrontierManager:
             if window.reachable[near].any():
                 self._forget(frontier.node_id)
             else:
-                self.give_up(frontier, "cut off: no way for the robot was found", now_ns)
+                self.give_up(frontier, CUT_OFF, now_ns)
 
     @staticmethod
     def _pairs(found: list[Found], old: list[Frontier]) -> list[tuple[float, int, int]]:

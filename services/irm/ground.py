@@ -111,6 +111,24 @@ class GroundStore:
         layer = self._layer.read(target)
         self._layer.write(target, np.where(cells != 0, cells, layer))
 
+    def window(self, spec: GridSpec, frame: Planar, doubtful: frozenset[int]) -> NDArray[np.uint8]:
+        """The ground in a window in `odom`, (h, w), without what was seen from doubtful keyframes.
+
+        Before a loop is closed, the ground of long ago lies beside where it is: ghosts behind the walls.
+        """
+        out = np.zeros(spec.shape, np.uint8)
+        for keyframe, patch in sorted(self._patches.items(), key=lambda item: item[1].turn):
+            if keyframe in doubtful or overlap(bounds(patch.spec, patch.motion), bounds(spec, frame)) is None:
+                continue
+            to_odom = frame.inverse().compose(patch.motion)
+            cells = resample(patch.unpacked(), patch.spec, spec, to_odom, 0)
+            out[cells != 0] = cells[cells != 0]
+        return out
+
+    def has(self, keyframes: frozenset[int]) -> bool:
+        """Whether one of these keyframes has a patch."""
+        return not keyframes.isdisjoint(self._patches)
+
     def follow(self, keyframes: dict[int, Planar]) -> int:
         """Move the patches of keyframes that SLAM has moved. Returns how many tiles were put together anew."""
         tiles: set[tuple[int, int]] = set()

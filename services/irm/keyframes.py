@@ -101,23 +101,24 @@ class Keyframes:
         return Anchor(int(self._id[row]), _planar(self._pose[row]))
 
     def deviations_m(self, anchor: Anchor, radius_m: float, least_m: float) -> dict[int, float]:
-        """Standard deviation of the position *relative to* a keyframe, of the keyframes within a radius of it.
+        """How uncertain the position is *relative to* a keyframe, of the keyframes within a radius of it, m.
+
+        The difference of the standard deviations. Along a chain of odometry whose error keeps its direction, as drift
+        does, that is exact; it does not grow with what both have drifted from the start, and it is none for keyframes
+        that a closure ties to each other. Of two that have drifted apart by as much it says nothing: a lower bound.
 
         Empty when none anywhere has more than `least_m`.
-
-        The difference of the marginal variances: exact along a chain of odometry, and none for keyframes that a
-        closure ties to each other, whatever both have drifted from the start.
         """
         row = self._row(anchor.keyframe)
         if row < 0:
             return {}
-        variance_m2 = np.abs(self._variance_m2 - self._variance_m2[row])
-        if float(variance_m2.max()) <= least_m**2:
+        deviation = np.sqrt(self._variance_m2)
+        relative = np.abs(deviation - deviation[row])
+        if float(relative.max()) <= least_m:
             return {}
         offset = self._pose[:, :2] - self._pose[row, :2]
         near = np.flatnonzero(np.hypot(offset[:, 0], offset[:, 1]) <= radius_m)
-        deviation = np.sqrt(variance_m2[near])
-        return dict(zip(self._id[near].tolist(), deviation.tolist(), strict=True))
+        return dict(zip(self._id[near].tolist(), relative[near].tolist(), strict=True))
 
     def _row(self, keyframe: int) -> int:
         row = int(np.searchsorted(self._id, keyframe))

@@ -12,7 +12,7 @@ from planning.frames import Planar
 from schemas.base import Pose
 from schemas.world import BREADCRUMB, FRONTIER, GlobalIrm
 from services.irm.config import Config
-from services.irm.frontiers import Frontier, FrontierManager
+from services.irm.frontiers import ISOLATED, Frontier, FrontierManager
 from services.irm.graph import ROBOT, RoadGraph
 from services.irm.keyframes import Anchor
 from services.irm.search import Search, path_totals
@@ -43,6 +43,7 @@ class Roadmap:
     next_id: int = 1
     version: int = 0
     last_breadcrumb: int = -1
+    _doubtful: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
         self.manager = FrontierManager(self.config)
@@ -61,14 +62,18 @@ class Roadmap:
         elapsed_s: float,
         ground_m2: float = 0.0,
         anchor: Anchor = Anchor(),  # noqa: B008
+        doubtful: frozenset[int] = frozenset(),
     ) -> None:
         """One round: new breadcrumb, frontiers, edges near the robot.
 
-        x_m, y_m: the robot in `map`. ground_m2: reachable ground known so far. anchor: the keyframe it is at.
+        x_m, y_m: the robot in `map`. ground_m2: reachable ground known so far. anchor: the keyframe it is at. doubtful:
+        keyframes whose place relative to it is not known well: what belongs to them may seem near and is not, so that
+        nothing is joined to it, and no edge judged, before a closure tells.
         """
         self.next_id = self.manager.update(
-            window, (x_m, y_m), now_ns, elapsed_s, self.next_id, ground_m2, anchor
+            window, (x_m, y_m), now_ns, elapsed_s, self.next_id, ground_m2, anchor, doubtful
         )
+        self._doubtful = doubtful
         search = Search(window)
         search.run(window.robot_cell, 3.0 * self.config.max_edge_m)
         self._place_robot(window, x_m, y_m)
@@ -101,9 +106,12 @@ class Roadmap:
         edge, now_m = self.graph.edges[a, b], self.road.straight_m(a, b)
         if abs(now_m - before_m) <= _SHIFTED_M:
             return
-        crumbs = {self.graph.nodes[n]["kind"] for n in (a, b)} == {BREADCRUMB}
-        if crumbs and not edge["driven"] and ROBOT not in (a, b) and abs(now_m - before_m) > _TORN_M:
+        crumbs = {self.graph.nodes[n]["kind"] for n in (a, b)} == {BREADCRUMB} and ROBOT not in (a, b)
+        torn = crumbs and abs(now_m - before_m) > _TORN_M
+        if torn and (not edge["driven"] or now_m > self.config.max_edge_m):
             self.road.drop_edge(a, b)
+        elif torn:  # it was not there that the robot drove
+            self.road.set_edge(a, b, max(now_m, edge["distance"]), edge["risk"], 0)
         elif now_m > edge["distance"]:
             self.road.set_edge(a, b, now_m, edge["risk"], edge["driven"])
 
@@ -118,7 +126,7 @@ class Roadmap:
     def _drop_breadcrumb(self, search: Search, x_m: float, y_m: float, anchor: Anchor) -> None:
         """Add a breadcrumb when none is within d_b, joined to the nearest ones by travel."""
         spacing, z_m = self.config.breadcrumb_spacing_m, self.graph.nodes[ROBOT]["z"]
-        near = self.road.near(x_m, y_m, z_m, self.config.max_edge_m, BREADCRUMB)
+        near = self._near(x_m, y_m, z_m, self.config.max_edge_m, BREADCRUMB)
         if near and near[0][0] < spacing:
             closest = near[0][1]
             if closest != self.last_breadcrumb:
@@ -159,7 +167,8 @@ class Roadmap:
         if not (self.graph.has_edge(a, b) and search.knows(*target)):
             return False
         # No way within the window is no evidence against a way that the robot has driven: it may lead around outside.
-        if not self.graph.edges[a, b]["driven"] or search.obstacle_between(place, target):
+        misplaced = search.is_lethal(*place) or search.is_lethal(*target)
+        if not self.graph.edges[a, b]["driven"] or (search.obstacle_between(place, target) and not misplaced):
             self.road.drop_edge(a, b)
         return False
 
@@ -196,7 +205,7 @@ class Roadmap:
         """Edges from the robot to everything near that it can reach, so that no detour over breadcrumbs is seen."""
         x, y = self.road.place(ROBOT)
         z = self.graph.nodes[ROBOT]["z"]
-        for _, node in self.road.near(x, y, z, 2.0 * self.config.max_edge_m, None):
+        for _, node in self._near(x, y, z, 2.0 * self.config.max_edge_m, None):
             d, rho = search.to(*self.road.place(node))
             if math.isfinite(d) and rho < self.config.max_edge_risk and not self._stacked(ROBOT, node):
                 self.road.set_edge(ROBOT, node, self._climbed_m(ROBOT, node, d), rho, 0)
@@ -220,7 +229,7 @@ class Roadmap:
         search.run(window.cell(f.x_m, f.y_m), self.config.max_edge_m)
         joined: set[int] = set()
         z = self.graph.nodes[node]["z"]
-        for _, other in self.road.near(f.x_m, f.y_m, z, self.config.max_edge_m, BREADCRUMB):
+        for _, other in self._near(f.x_m, f.y_m, z, self.config.max_edge_m, BREADCRUMB):
             if len(joined) < 3 and self._join(node, other, search):
                 joined.add(other)
         for other in old:
@@ -244,7 +253,7 @@ class Roadmap:
             f = self.manager.frontiers[node]
             f.isolated = 0 if self.road.leads_to(node, components) else f.isolated + 1
             if f.isolated > 3 * self.config.missed_rounds:
-                self.manager.give_up(f, "no way over the graph", now_ns)
+                self.manager.give_up(f, ISOLATED, now_ns)
                 self.road.drop_node(node)
 
     def _join_over_robot(self, node: int) -> None:
@@ -256,7 +265,7 @@ class Roadmap:
     def _review_edges(self, window: Window) -> None:
         """Evaluate the edges of one nearby breadcrumb again, in turn: ground changes, closures join what was two."""
         x, y = self.road.place(ROBOT)
-        near = [n for _, n in self.road.near(x, y, self.graph.nodes[ROBOT]["z"], 12.0, BREADCRUMB)]
+        near = [n for _, n in self._near(x, y, self.graph.nodes[ROBOT]["z"], 12.0, BREADCRUMB)]
         if not near:
             return
         node = near[self.version % len(near)]
@@ -267,11 +276,23 @@ class Roadmap:
             return
         search.run(cell, self.config.max_edge_m)
         # Its neighbours and what lies nearest: an edge that went comes back when its ground is free again.
-        around = self.road.near(*place, z, self.config.max_edge_m, BREADCRUMB)
+        around = self._near(*place, z, self.config.max_edge_m, BREADCRUMB)
         others = {n for _, n in around[: self.config.edges_per_node + 1]} | set(self.graph.neighbors(node))
         for other in sorted(others - {node, ROBOT}):
-            if self.graph.nodes[other]["kind"] == BREADCRUMB:
+            if self.graph.nodes[other]["kind"] == BREADCRUMB and self._is_certain(other):
                 self._join(node, other, search)
+
+    def _near(
+        self, x_m: float, y_m: float, z_m: float, radius_m: float, kind: int | None
+    ) -> list[tuple[float, int]]:
+        """`RoadGraph.near` without what may not be there."""
+        found = self.road.near(x_m, y_m, z_m, radius_m, kind)
+        return [f for f in found if self._is_certain(f[1])] if self._doubtful else found
+
+    def _is_certain(self, node: int) -> bool:
+        frontier = self.manager.frontiers.get(node)
+        keyframe = self.graph.nodes[node].get("keyframe") if frontier is None else frontier.keyframe
+        return keyframe not in self._doubtful
 
     def message(self, pose: Pose, map_to_odom: Pose, stamp_ns: int, whole: bool) -> GlobalIrm:
         """The graph as a message: whole, or what has changed since the last message."""

@@ -61,6 +61,11 @@ class Search:
                 return True
         return False
 
+    def is_lethal(self, x_m: float, y_m: float) -> bool:
+        """Whether a point lies in an obstacle, where no node can be: it is not where it seems to be."""
+        row, column = self._window.cell(x_m, y_m)
+        return self._window.spec.contains(row, column) and bool(self._window.state[row, column] == LETHAL)
+
     def _nearest_reached(self, x_m: float, y_m: float) -> tuple[int, int] | None:
         row, column = self._window.cell(x_m, y_m)
         height, width = self._cost.shape
@@ -72,8 +77,18 @@ class Search:
             piece = self._cost[r0:r1, c0:c1]
             if np.isfinite(piece).any():
                 index = int(np.argmin(piece))
-                return r0 + index // piece.shape[1], c0 + index % piece.shape[1]
+                cell = r0 + index // piece.shape[1], c0 + index % piece.shape[1]
+                return cell if reach == 0 or self._open(row, column, *cell) else None
         return None
+
+    def _open(self, row: int, column: int, r: int, c: int) -> bool:
+        """Whether no obstacle lies between two cells: the cell reached may be on the other side of a thin wall."""
+        steps = 2 * max(abs(r - row), abs(c - column))
+        for i in range(1, steps):
+            at = round(row + (r - row) * i / steps), round(column + (c - column) * i / steps)
+            if self._window.spec.contains(*at) and self._window.state[at] == LETHAL:
+                return False
+        return True
 
 
 @njit

@@ -48,6 +48,8 @@ __all__ = ["Config", "IrmStage", "create", "spec"]
 
 _BLOCKED_AGAIN_NS = 5 * SECOND_NS
 """Blocked at one place again after so long, it counts once more."""
+_DOUBT_WINDOWS = 1.25
+"""Keyframes within so many widths of the window are asked for their certainty: what they saw may lie in it."""
 _MAX_PENDING = 50
 _PROGRESS_M2 = 0.3
 _SAME_M = 1e-6
@@ -85,6 +87,7 @@ class IrmStage:
         self._keyframes = Keyframes()
         self._odom = OdomInMap()
         self._moved = False
+        self._doubtful: frozenset[int] = frozenset()
         self._resumed = False
         self._pending: list[CoverageScan] = []
         self._penalties: list[tuple[int, float, float]] = []
@@ -182,10 +185,15 @@ class IrmStage:
         assert self._ground and self._coverage and self._ground_store and self._store
         frame, spec = self._odom.pose, grid_of(risk)
         anchor = self._keyframes.reference(*self._place(odometry)[:2])
-        reach_m, from_m = 0.5 * spec.width * spec.resolution_m, self._config.blur_from_m
+        reach_m, from_m = _DOUBT_WINDOWS * spec.width * spec.resolution_m, self._config.blur_from_m
         if from_m > 0.0:
-            self._store.blur(self._keyframes.deviations_m(anchor, reach_m, from_m), from_m)
-        known = read_layer(self._ground, spec, frame)
+            deviations_m = self._keyframes.deviations_m(anchor, reach_m, from_m)
+            self._store.blur(deviations_m, from_m)
+            self._doubtful = frozenset(k for k, d in deviations_m.items() if d > from_m)
+        if self._ground_store.has(self._doubtful):
+            known = self._ground_store.window(spec, frame, self._doubtful)
+        else:
+            known = read_layer(self._ground, spec, frame)
         window = build_window(
             risk, odometry.pose.x_m, odometry.pose.y_m, self._config, known,
             read_layer(self._coverage, spec, frame), [(x, y) for _, x, y in self._penalties], frame,
@@ -224,7 +232,7 @@ class IrmStage:
             self._roadmap.manager.progressed()
         if policy is not None:
             self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, elapsed)
-        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, ground_m2, anchor)
+        self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, ground_m2, anchor, self._doubtful)
         first = self._roadmap.version == 0
         message = self._roadmap.message(odometry.pose, self._frame_pose(odometry), now, whole or first)
         s, picture = moved(window.spec, window_picture(window), window.frame)

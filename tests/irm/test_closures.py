@@ -14,17 +14,19 @@ from planning.frames import Planar
 from planning.grid import FREE, LETHAL, UNKNOWN, GridSpec, window_around
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs
-from schemas.sensing import Odometry
+from schemas.sensing import Odometry, PoseGraph
 from schemas.topics import COVERAGE, COVERAGE_SCAN, GLOBAL_IRM, LOCAL_IRM, ODOMETRY, POSE_GRAPH, RISK_MAP
 from schemas.world import BREADCRUMB, FRONTIER, CoverageSummary, GridHeader, LocalIrm, RiskMap
 from services.irm.config import Config
 from services.irm.graph import ROBOT
 from services.irm.keyframes import IDENTITY
 from services.irm.resample import resample
+from services.irm.roadmap import Roadmap
+from services.irm.search import Search
 from services.irm.stage import IrmStage
 from services.irm.window import GROUND
 from tests.irm.test_roadmap import lap, ring
-from tests.irm.worlds import MAX_CLEARANCE_M, RADIUS_M, pose_graph, scan_at
+from tests.irm.worlds import MAX_CLEARANCE_M, RADIUS_M, Belief, pose_graph, scan_at, two_rooms
 from tests.riskmap.helpers import inputs, merged
 
 RES = 0.2
@@ -346,3 +348,77 @@ def test_frontiers_out_of_the_window_move_with_the_keyframe_they_were_seen_from(
     for n, d in graph.nodes(data=True):
         if d["kind"] == FRONTIER:
             assert (d["x"], d["y"]) == (manager.frontiers[n].x_m, manager.frontiers[n].y_m)
+
+
+def doubts(loop: Loop) -> PoseGraph:
+    """The pose graph of a SLAM that says how unsure it is: a standard deviation of 5 % of the path, until a closure."""
+    graph = pose_graph(loop.keyframes)
+    path_m = np.arange(len(loop.keyframes), dtype=np.float64)
+    deviation = 0.0 * path_m if loop.frame is not IDENTITY else 0.05 * path_m
+    return graph.model_copy(update={"covariance": np.stack([deviation**2, 0 * path_m, 0 * path_m], axis=1)})
+
+
+def unsure_drive(steps: int) -> Loop:
+    """Around the ring and on, without a closure: what was seen at first lies more than a metre from where it is."""
+    loop = Loop(DRIFT)
+    for _ in range(steps):
+        loop.now = getattr(loop, "now", 0) + SECOND_NS
+        feeds = loop.feeds(graph=False)
+        loop.stage.step(loop.now, merged(feeds, inputs((POSE_GRAPH, doubts(loop)))))
+        loop.step_count += 1
+    loop.step_count -= 1
+    return loop
+
+
+def test_before_a_closure_nothing_is_joined_to_what_only_seems_near() -> None:
+    loop = unsure_drive(STEPS + 12)
+    graph, crumbs = loop.stage._roadmap.graph, loop.crumbs()
+    first_lap = [n for n in crumbs if graph.nodes[n]["keyframe"] < 10]
+    second_lap = [n for n in crumbs if graph.nodes[n]["keyframe"] >= STEPS // 2]
+    assert len(first_lap) >= 3 and len(second_lap) >= 2, (
+        "an old breadcrumb is no reason not to drop a new one"
+    )
+    assert any(math.dist(crumbs[a], crumbs[b]) < 3.0 for a in first_lap for b in second_lap)
+    assert not any(graph.has_edge(a, b) for a in first_lap for b in (*second_lap, ROBOT))
+    loop.close()
+    for _ in range(30):
+        loop.now += SECOND_NS
+        feeds = loop.feeds(graph=False)
+        loop.stage.step(loop.now, merged(feeds, inputs((POSE_GRAPH, doubts(loop)))))
+    assert any(graph.has_edge(a, b) for a in first_lap for b in second_lap), "after it they are"
+
+
+def test_before_a_closure_the_ground_of_long_ago_is_no_ground_here() -> None:
+    loop = unsure_drive(STEPS + 4)
+    stage, spec = loop.stage, GridSpec(RES, -10, -10, 60, 60)
+    assert stage._ground_store is not None and stage._ground is not None
+    known = stage._ground_store.window(spec, stage._odom.pose, stage._doubtful)
+    everything = stage._ground_store.window(spec, stage._odom.pose, frozenset())
+    assert stage._doubtful and (known != 0).sum() < (everything != 0).sum()
+    assert ((everything == GROUND) == (stage._ground.read(spec) == GROUND)).mean() > 0.97
+
+
+@pytest.mark.parametrize(("shift_m", "kept", "driven"), [(0.4, True, 1), (2.0, True, 0), (9.0, False, 0)])
+def test_an_edge_that_a_closure_tears_apart_was_not_driven_there(
+    shift_m: float, kept: bool, driven: int
+) -> None:
+    road = Roadmap(CONFIG)
+    for node, x in ((1, 0.0), (2, 2.0)):
+        road.road.set_node(node, x, 0.0, 0.0, BREADCRUMB, 0.0, 1.0)
+        road.road.belong(node, node, (0.0, 0.0))
+    road.road.set_edge(1, 2, 2.1, 0.0, 1)
+    road.follow({2: Planar(2.0 + shift_m, 0.0, 0.0)})
+    assert road.graph.has_edge(1, 2) is kept
+    if kept:
+        edge = road.graph.edges[1, 2]
+        assert (edge["driven"], edge["distance"]) == (driven, pytest.approx(2.0 + shift_m))
+
+
+def test_no_edge_reaches_through_a_thin_wall() -> None:
+    flat = two_rooms(door_m=0.0, resolution_m=RES)
+    belief = Belief.new(CONFIG, RES)
+    window = belief.window(flat.risk_map(), -2.0, 0.0)
+    search = Search(window)
+    search.run(window.robot_cell, 6.0)
+    assert math.isfinite(search.to(-0.5, 0.0)[0])
+    assert search.to(0.3, 0.0) == (math.inf, 1.0)
