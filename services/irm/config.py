@@ -35,10 +35,16 @@ class Config(BaseModel):
         0.9, gt=0.5, lt=1, description="From this probability a cell is covered."
     )
     blur_from_m: float = Field(
-        0.5,
+        2.0,
         ge=0,
         le=100,
-        description="What was seen from keyframes less certain than this relative to the robot counts less, m; 0: off.",
+        description="Looks from keyframes less certain than this relative to the robot's count less, m; 0: off.",
+    )
+    doubt_from_m: float = Field(
+        0.5,
+        gt=0,
+        le=100,
+        description="What belongs to keyframes less certain than this is neither joined nor judged, m.",
     )
     # traversability
     clearance_margin_m: float = Field(0.0, ge=-0.05, le=1, description="Added to the footprint's radius, m.")

@@ -37,7 +37,7 @@ from services.irm.areas import Areas
 from services.irm.config import Config
 from services.irm.footprints import FootprintStore
 from services.irm.ground import GroundStore
-from services.irm.keyframes import Keyframes, OdomInMap, is_near
+from services.irm.keyframes import Anchor, Keyframes, OdomInMap, is_near
 from services.irm.local_irm import LocalIrmBuilder
 from services.irm.resample import moved
 from services.irm.roadmap import Roadmap
@@ -187,11 +187,7 @@ class IrmStage:
         assert self._ground and self._coverage and self._ground_store and self._store
         frame, spec = self._odom.pose, grid_of(risk)
         anchor = self._keyframes.reference(*self._place(odometry)[:2])
-        reach_m, from_m = _DOUBT_WINDOWS * spec.width * spec.resolution_m, self._config.blur_from_m
-        if from_m > 0.0:
-            deviations_m = self._keyframes.deviations_m(anchor, reach_m, from_m)
-            self._store.blur(deviations_m, from_m)
-            self._doubtful = frozenset(k for k, d in deviations_m.items() if d > from_m)
+        self._doubt(anchor, _DOUBT_WINDOWS * spec.width * spec.resolution_m)
         if self._ground_store.has(self._doubtful):
             known = self._ground_store.window(spec, frame, self._doubtful)
         else:
@@ -203,6 +199,18 @@ class IrmStage:
         )  # fmt: skip
         self._ground_store.write(spec, np.where(risk.state != UNKNOWN, known, np.uint8(0)), frame, anchor)
         return window
+
+    def _doubt(self, anchor: Anchor, reach_m: float) -> None:
+        """Which keyframes around the robot are not certainly where they seem to be, relative to its own."""
+        assert self._store
+        config = self._config
+        least_m = (
+            min(config.doubt_from_m, config.blur_from_m) if config.blur_from_m > 0 else config.doubt_from_m
+        )
+        deviations_m = self._keyframes.deviations_m(anchor, reach_m, least_m)
+        self._doubtful = frozenset(k for k, d in deviations_m.items() if d > config.doubt_from_m)
+        if config.blur_from_m > 0.0:
+            self._store.blur(deviations_m, config.blur_from_m)
 
     def _place(self, odometry: Odometry) -> Planar:
         """The robot in `map`."""
