@@ -40,6 +40,9 @@ class Config(BaseModel):
         le=100,
         description="Looks from keyframes less certain than this relative to the robot's count less, m; 0: off.",
     )
+    odometry_drift: float = Field(
+        0.02, gt=0, le=1, description="Odometry errs by no more than this share of the way, m/m."
+    )
     doubt_from_m: float = Field(
         0.5,
         gt=0,

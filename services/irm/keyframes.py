@@ -100,12 +100,13 @@ class Keyframes:
             row = int(np.argmin(np.hypot(self._pose[:, 0] - x_m, self._pose[:, 1] - y_m)))
         return Anchor(int(self._id[row]), _planar(self._pose[row]))
 
-    def deviations_m(self, anchor: Anchor, radius_m: float, least_m: float) -> dict[int, float]:
+    def deviations_m(self, anchor: Anchor, radius_m: float, least_m: float, drift: float) -> dict[int, float]:
         """How uncertain the position is *relative to* a keyframe, of the keyframes within a radius of it, m.
 
-        The difference of the standard deviations. Along a chain of odometry whose error keeps its direction, as drift
-        does, that is exact; it does not grow with what both have drifted from the start, and it is none for keyframes
-        that a closure ties to each other. Of two that have drifted apart by as much it says nothing: a lower bound.
+        Marginal variances do not tell that, so the smaller of two bounds is taken: the difference of the standard
+        deviations, which does not grow with what both have drifted from the start and is none for keyframes that a
+        closure ties to each other; and `drift` (m/m) times the way between them along the keyframes, as odometry
+        holds together what was driven lately whatever the rest of the graph says.
 
         Empty when none anywhere has more than `least_m`.
         """
@@ -116,6 +117,8 @@ class Keyframes:
         relative = np.abs(deviation - deviation[row])
         if float(relative.max()) <= least_m:
             return {}
+        along = np.concatenate((np.zeros(1), np.hypot(*np.diff(self._pose[:, :2], axis=0).T).cumsum()))
+        relative = np.minimum(relative, drift * np.abs(along - along[row]))
         offset = self._pose[:, :2] - self._pose[row, :2]
         near = np.flatnonzero(np.hypot(offset[:, 0], offset[:, 1]) <= radius_m)
         return dict(zip(self._id[near].tolist(), relative[near].tolist(), strict=True))

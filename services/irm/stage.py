@@ -88,7 +88,6 @@ class IrmStage:
         self._roadmap = Roadmap(config)
         self._keyframes = Keyframes()
         self._odom = OdomInMap()
-        self._moved = False
         self._doubtful: frozenset[int] = frozenset()
         self._resumed = False
         self._pending: list[CoverageScan] = []
@@ -147,12 +146,14 @@ class IrmStage:
         changed, motion = self._keyframes.read(received.message)
         if not changed:
             return
-        self._moved = True
+        before_m2 = self._areas.update()[1] if self._areas else 0.0
         self._odom.follow(motion)
         self._roadmap.follow(changed)
         if self._store is not None and self._ground_store is not None:
             self._store.follow(changed)
             self._ground_store.follow(changed)
+        # What a closure changes of the area is neither progress nor the lack of it.
+        self._covered_m2 += (self._areas.update()[1] if self._areas else 0.0) - before_m2
 
     def _read_follower(self, now: Stamp, inputs: Inputs, odometry: Odometry) -> None:
         """Where the robot was blocked or stuck, the ground ahead is riskier than it looks."""
@@ -207,7 +208,7 @@ class IrmStage:
         least_m = (
             min(config.doubt_from_m, config.blur_from_m) if config.blur_from_m > 0 else config.doubt_from_m
         )
-        deviations_m = self._keyframes.deviations_m(anchor, reach_m, least_m)
+        deviations_m = self._keyframes.deviations_m(anchor, reach_m, least_m, config.odometry_drift)
         self._doubtful = frozenset(k for k, d in deviations_m.items() if d > config.doubt_from_m)
         if config.blur_from_m > 0.0:
             self._store.blur(deviations_m, config.blur_from_m)
@@ -235,8 +236,6 @@ class IrmStage:
         anchor = self._keyframes.reference(place.x_m, place.y_m)
         assert self._areas is not None
         ground_m2, covered_m2 = self._areas.update()
-        if self._moved:  # what a closure has changed of the area is neither progress nor the lack of it
-            self._covered_m2, self._moved = covered_m2, False
         if covered_m2 >= self._covered_m2 + _PROGRESS_M2:
             self._covered_m2 = covered_m2
             self._roadmap.manager.progressed()
@@ -282,7 +281,7 @@ class IrmStage:
         state = {
             "roadmap": self._roadmap.state(),
             "keyframes": self._keyframes.state(),
-            "odom": [*self._odom.state(), self._moved],
+            "odom": self._odom.state(),
             "penalties": self._penalties,
             "pending": [scan.model_dump() for scan in self._pending],
             "anchors": self._local.state() if self._local else [],
@@ -303,8 +302,7 @@ class IrmStage:
         state = unpack_snapshot(snapshot)
         self._roadmap.set_state(state["roadmap"])
         self._keyframes.set_state(state["keyframes"])
-        *odom, self._moved = state["odom"]
-        self._odom.set_state(odom)
+        self._odom.set_state(state["odom"])
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
         self._pending = [CoverageScan(**scan) for scan in state["pending"]]
         self._global_ns = state["global_ns"]
@@ -330,7 +328,7 @@ class IrmStage:
             "footprints": self._store.take_changes(),
             "ground": self._ground_store.take_changes(),
             "keyframes": self._keyframes.take_changes(),
-            "odom": [*self._odom.state(), self._moved],
+            "odom": self._odom.state(),
             "resolution": self._ground.resolution_m,
             "radius": self._local.footprint_radius_m,
             "version": self._local.version,
@@ -351,8 +349,7 @@ class IrmStage:
         self._store.apply_changes(state["footprints"])
         self._ground_store.apply_changes(state["ground"])
         self._keyframes.apply_changes(state["keyframes"])
-        *odom, self._moved = state["odom"]
-        self._odom.set_state(odom)
+        self._odom.set_state(state["odom"])
         self._local.version = state["version"]
         self._global_ns, self._covered_m2 = state["global_ns"], state["covered_m2"]
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]

@@ -31,7 +31,7 @@ from tests.riskmap.helpers import inputs, merged
 
 RES = 0.2
 WINDOW_M = 12.0
-CONFIG = Config(size=21, sensor_range_m=4.0, max_edge_m=6.0, give_up_s=600.0)
+CONFIG = Config(size=21, sensor_range_m=4.0, max_edge_m=6.0, give_up_s=600.0, odometry_drift=0.05)
 WIDE = GridSpec(RES, -50, -50, 200, 180)
 STEPS = len(lap())
 

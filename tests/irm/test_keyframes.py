@@ -63,10 +63,12 @@ def test_deviations_are_relative_to_the_robots_keyframe_not_to_the_start() -> No
     held = Keyframes()
     places = {k: Planar(2.0 * k, 0.0, 0.0) for k in range(4)}
     held.read(graph(places, {0: 0.0, 1: 2.0, 2: 8.0, 3: 8.0}))  # x and y together: 0, 4, 16, 16
-    found = held.deviations_m(held.reference(6.0, 0.0), 5.0, 0.5)
+    found = held.deviations_m(held.reference(6.0, 0.0), 5.0, 0.5, 1.0)
     assert found == {1: pytest.approx(2.0), 2: 0.0, 3: 0.0}, "0 is too far away"
+    found = held.deviations_m(held.reference(6.0, 0.0), 5.0, 0.5, 0.02)
+    assert found == {1: pytest.approx(0.08), 2: 0.0, 3: 0.0}, "odometry knows what was driven lately"
     held.read(graph(places, dict.fromkeys(places, 100.0)))
-    assert held.deviations_m(held.reference(6.0, 0.0), 5.0, 0.5) == {}, "all have drifted alike"
+    assert held.deviations_m(held.reference(6.0, 0.0), 5.0, 0.5, 1.0) == {}, "all have drifted alike"
 
 
 @pytest.mark.parametrize("first", ["graph", "odometry"])
