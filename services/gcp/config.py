@@ -23,7 +23,7 @@ class Config(BaseModel):
         2.0, ge=0, le=10, description="The target is left for one whose Q is better by this share of |Q|, and"
     )
     switch_margin: float = Field(
-        12.0, ge=0, le=1000, description="better by this much too, nats: more keeps the target longer."
+        16.0, ge=0, le=1000, description="better by this much too, nats: more keeps the target longer."
     )
     crumb_share: float = Field(
         0.1, ge=0, le=1, description="Of a target that promises less than this share of what it once did,"
