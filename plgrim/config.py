@@ -145,7 +145,7 @@ class Config(BaseSettings):
             if other:
                 section["robot"] = {"profile": self.profile, **section.get("robot", {})}
             if rough:
-                section.setdefault("lidar", dict(DOWNWARD_LIDAR))
+                section["lidar"] = {**DOWNWARD_LIDAR, **section.get("lidar", {})}
         elif service == "riskmap" and other:
             section.setdefault("profile", self.profile)
         elif service == "reconciler" and other:

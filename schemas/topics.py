@@ -97,7 +97,7 @@ COVERAGE: Topic[CoverageSummary] = _topic(
 )  # fmt: skip
 COVERAGE_WINDOW: Topic[CoverageWindow] = _topic(
     CoverageWindow, "irm/coverage_window", "status", "the belief around the robot as a picture", period_ms=1000,
-    max_bytes=1 * _MIB, link=True,
+    max_bytes=4 * _MIB, link=True,
 )  # fmt: skip
 GLOBAL_POLICY: Topic[GlobalPolicy] = _topic(
     GlobalPolicy, "gcp/global_policy", "irm lcp mission status reconciler", "the QMDP policy, its target and why",

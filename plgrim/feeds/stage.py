@@ -108,6 +108,7 @@ class FeedStage:
         return PointCloud(
             stamp_ns=now,
             sensor_in_odom=Pose(x_m=x, y_m=y, z_m=height_m, yaw_rad=yaw),
+            sensor_in_base=Pose(z_m=height_m),
             range_m=self._recording.range_m,
             points_m=moment.points_m,
         )

@@ -85,6 +85,7 @@ class Keeper:
         for state in states:
             if tries >= _TRIES:
                 self._log.error("the state is not used: no life that began with it went on", tries=tries)
+                self._tries.unlink(missing_ok=True)  # what this life comes to is a state to go on from again
                 break
             if state.saved_ns > now:
                 self._log.warning("journal of another mission: not used", saved_s=state.saved_ns / SECOND_NS)

@@ -29,7 +29,7 @@ class Config(BaseModel):
         0.1, ge=0, le=1, description="Of a target that promises less than this share of what it once did,"
     )
     crumb_margin: float = Field(
-        0.5, ge=0, le=1000, description="twice as far as the best: that must be better by this, nats."
+        2.0, ge=0, le=1000, description="twice as far as the best: that must be better by this, nats."
     )
     same_target_m: float = Field(
         2.0, gt=0, le=20, description="A frontier so near to the target's place is the same target, m."

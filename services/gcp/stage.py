@@ -11,6 +11,7 @@ from planning.frames import Planar
 from planning.graph_mirror import GraphMirror, RoadMap
 from planning.randomness import stream
 from planning.reward import RewardWeights
+from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Outputs, Stage, StageSetup, StageSpec, Stamp, outputs
 from schemas.operation import MissionPhase, MissionState
 from schemas.policy import Alternative, GlobalPolicy
@@ -65,6 +66,10 @@ class GcpStage:
         self._target = _Target()
         self._tick = 0
         self._asked_ns = -1
+        self._frame = Pose()
+        """Of `odom` in the `map` that the graph is in: at a closure that of the odometry is ahead of the graph."""
+        self._frame = Pose()
+        """Of `odom` in the `map` that the graph is in: at a closure that of the odometry is ahead of the graph."""
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One step: the global policy, and a request for the graph when a difference was missed."""
@@ -82,6 +87,8 @@ class GcpStage:
         fits = True
         for received in inputs.new(GLOBAL_IRM):
             fits = self._mirror.apply(received.message)
+            if fits:
+                self._frame = received.message.map_to_odom
         if fits or (self._asked_ns >= 0 and now - self._asked_ns < self.config.ask_again_s * SECOND_NS):
             return False
         self._asked_ns = now
@@ -91,7 +98,7 @@ class GcpStage:
         planner = GlobalPlanner(self._mirror.road_map(), self.config.reward)
         belief = self._belief(odometry)
         choice = self._choose(planner, belief, mission)
-        robot = np.array(_robot_xyz(odometry))
+        robot = np.array(_robot_xyz(self._frame, odometry.pose))
         self._remember(planner, choice)
         to_go = planner.values_to_go(robot, self.config.local_range_m)
         return self._message(now, odometry, planner, choice, (planner.values(), to_go), robot)
@@ -101,7 +108,7 @@ class GcpStage:
         and tick.
         """
         rng = stream(self._seed, "gcp", self._tick)
-        mean = np.array(_robot_xyz(odometry))
+        mean = np.array(_robot_xyz(self._frame, odometry.pose))
         covariance = np.asarray(odometry.covariance)[:2, :2]
         variance, axes = np.linalg.eigh((covariance + covariance.T) / 2.0)
         # The breadcrumbs around drift along with the robot: its place among them is better known than that in `map`.
@@ -218,7 +225,7 @@ class GcpStage:
             switched=choice.switched,
             reason=choice.reason,
             alternatives=[_alternative(planner, other) for other in choice.alternatives],
-            map_to_odom=odometry.map_to_odom,
+            map_to_odom=self._frame,
             node_id=road_map.node_id[told],
             node_xyz_m=road_map.xyz_m[told],
             action=values[0].action[told],
@@ -236,6 +243,7 @@ class GcpStage:
                 "target": [self._target.id, *self._target.xyz_m, self._target.gain],
                 "tick": self._tick,
                 "asked_ns": self._asked_ns,
+                "frame": self._frame.model_dump(),
             }
         )
 
@@ -246,6 +254,7 @@ class GcpStage:
         target, x_m, y_m, z_m, gain = state["target"]
         self._target = _Target(target, (x_m, y_m, z_m), gain)
         self._tick, self._asked_ns = state["tick"], state["asked_ns"]
+        self._frame = Pose(**state["frame"])
 
     def journal(self, outputs: Outputs) -> bytes:
         """The target held; the graph comes again from irm."""
@@ -269,9 +278,8 @@ def _nodes_to_tell(
     return np.flatnonzero(near)
 
 
-def _robot_xyz(odometry: Odometry) -> tuple[float, float, float]:
+def _robot_xyz(frame: Pose, pose: Pose) -> tuple[float, float, float]:
     """The robot's place in `map`."""
-    frame, pose = odometry.map_to_odom, odometry.pose
     x_m, y_m = Planar(frame.x_m, frame.y_m, frame.yaw_rad).apply(pose.x_m, pose.y_m)
     return x_m, y_m, frame.z_m + pose.z_m
 

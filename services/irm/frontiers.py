@@ -21,6 +21,8 @@ from services.irm.window import Window
 CUT_OFF = "cut off: no way for the robot was found"
 ISOLATED = "no way over the graph"
 _NO_WAY = (CUT_OFF, ISOLATED)
+_NEWS_M = 0.3
+"""A place that a closure moves by more may have a way now."""
 
 
 @dataclass(slots=True)
@@ -150,11 +152,16 @@ class FrontierManager:
 
     def follow(self, keyframes: dict[int, Planar]) -> list[int]:
         """Move what belongs to keyframes that SLAM has moved. Returns the ids of the frontiers that moved."""
-        # A closure is news: what no way led to may have been a ghost of drift, or have a way now.
-        self.given_up = [g for g in self.given_up if g.keyframe not in keyframes or g.reason not in _NO_WAY]
+        kept = []
         for g in self.given_up:
             if g.keyframe in keyframes:
+                before = g.x_m, g.y_m
                 g.x_m, g.y_m = keyframes[g.keyframe].apply(g.local_x_m, g.local_y_m)
+                # A closure is news: what no way led to may have been a ghost of drift, or have a way now.
+                if g.reason in _NO_WAY and math.dist(before, (g.x_m, g.y_m)) > _NEWS_M:
+                    continue
+            kept.append(g)
+        self.given_up = kept
         moved = [k for k in sorted(self.frontiers) if self.frontiers[k].keyframe in keyframes]
         for node_id in moved:
             f = self.frontiers[node_id]

@@ -165,10 +165,12 @@ class OdomInMap:
     def __init__(self) -> None:
         self.pose = IDENTITY
         self._apart_ns = -1
+        self._ahead = False
 
     def follow(self, motion: Planar) -> None:
-        """The newest keyframe has moved in `map`."""
-        if not motion.is_identity:
+        """The newest keyframe has moved in `map`: late, if map_to_odom has been gone by already."""
+        ahead, self._ahead = self._ahead, False
+        if not motion.is_identity and not ahead:
             self.pose = motion.compose(self.pose)
 
     def update(self, told: Planar, now_ns: int, known: bool) -> Planar:
@@ -177,16 +179,17 @@ class OdomInMap:
         if apart and self._apart_ns < 0:
             self._apart_ns = now_ns
         if not apart or now_ns - self._apart_ns >= _WAIT_NS:
+            self._ahead |= apart
             self.pose, self._apart_ns = told, -1
         return self.pose
 
     def state(self) -> list[Any]:
         """For a snapshot."""
-        return [list(self.pose), self._apart_ns]
+        return [list(self.pose), self._apart_ns, self._ahead]
 
     def set_state(self, state: list[Any]) -> None:
         """From a snapshot."""
-        self.pose, self._apart_ns = Planar(*state[0]), state[1]
+        self.pose, self._apart_ns, self._ahead = Planar(*state[0]), state[1], bool(state[2])
 
 
 def is_near(a: Planar, b: Planar, within_m: float, within_rad: float) -> bool:

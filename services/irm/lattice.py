@@ -116,12 +116,77 @@ def connect_neighbours(
 ) -> int:
     """Edges between 8-connected anchors: straight where the robot fits, else the best short path around the corner.
 
-    Writes distance_m and risk, (n, 8), both directions; bent edges into the bent arrays. Returns their number.
+    A path may be longer than the straight line by `detour`; where the lattice would fall apart without it, by any
+    length (the ground is connected: a lattice that is not would hold the robot in a pocket). Writes distance_m and
+    risk, (n, 8), both directions; bent edges into the bent arrays. Returns their number.
     """
+    bent_start[0] = 0
+    label = np.arange(size * size)
+    bent = _connect(
+        free_space, clearance_m, hazard, step_cost, needed_m, resolution_m, spacing_m, ix0, iy0, size, detour,
+        state, anchor_m, label, 0, distance_m, risk, bent_edge, bent_start, bent_xy,
+    )  # fmt: skip
+    if _label_lattice(size, state, distance_m, label) > 1:
+        bent = _connect(
+            free_space, clearance_m, hazard, step_cost, needed_m, resolution_m, spacing_m, ix0, iy0, size,
+            math.inf, state, anchor_m, label, bent, distance_m, risk, bent_edge, bent_start, bent_xy,
+        )  # fmt: skip
+    return bent
+
+
+@njit
+def _label_lattice(
+    size: int, state: NDArray[np.uint8], distance_m: NDArray[np.float32], label: NDArray[np.int64]
+) -> int:
+    """Number of connected components of the traversable nodes; label: (n,) out, -1 for the others."""
+    stack = np.empty(size * size, np.int64)
+    label[:] = -1
+    count = 0
+    for first in range(size * size):
+        if state[first] != 1 or label[first] >= 0:
+            continue
+        label[first], stack[0], top = count, first, 1
+        while top > 0:
+            top -= 1
+            node = stack[top]
+            for k in range(8):
+                if distance_m[node, k] > 0.0:
+                    other = node + _DY[k] * size + _DX[k]
+                    if label[other] < 0:
+                        label[other] = count
+                        stack[top] = other
+                        top += 1
+        count += 1
+    return count
+
+
+@njit
+def _connect(
+    free_space: NDArray[np.bool_],
+    clearance_m: NDArray[np.float32],
+    hazard: NDArray[np.float32],
+    step_cost: NDArray[np.float32],
+    needed_m: float,
+    resolution_m: float,
+    spacing_m: float,
+    ix0: int,
+    iy0: int,
+    size: int,
+    detour: float,
+    state: NDArray[np.uint8],
+    anchor_m: NDArray[np.float64],
+    label: NDArray[np.int64],
+    bent: int,
+    distance_m: NDArray[np.float32],
+    risk: NDArray[np.float32],
+    bent_edge: NDArray[np.int32],
+    bent_start: NDArray[np.int32],
+    bent_xy: NDArray[np.float32],
+) -> int:
+    """One pass over the pairs of anchors whose labels differ. bent: bent edges so far. Returns how many there are."""
     cost = np.empty(free_space.shape, np.float64)
     parent = np.empty(free_space.shape, np.int32)
-    bent, points = 0, 0
-    bent_start[0] = 0
+    points = bent_start[bent]
     for node in range(size * size):
         if state[node] != 1:
             continue
@@ -132,6 +197,8 @@ def connect_neighbours(
             if r < 0 or c < 0 or r >= size or c >= size or state[r * size + c] != 1:
                 continue
             other = r * size + c
+            if label[other] == label[node]:
+                continue
             x0, y0, x1, y1 = anchor_m[node, 0], anchor_m[node, 1], anchor_m[other, 0], anchor_m[other, 1]
             if segment_min_clearance(
                 clearance_m, resolution_m, ix0, iy0, x0, y0, x1, y1

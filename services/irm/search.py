@@ -75,10 +75,12 @@ class Search:
             if r0 >= r1 or c0 >= c1:
                 continue
             piece = self._cost[r0:r1, c0:c1]
-            if np.isfinite(piece).any():
-                index = int(np.argmin(piece))
+            for index in np.argsort(piece, axis=None, kind="stable")[
+                : int(np.isfinite(piece).sum())
+            ].tolist():
                 cell = r0 + index // piece.shape[1], c0 + index % piece.shape[1]
-                return cell if reach == 0 or self._open(row, column, *cell) else None
+                if reach == 0 or self._open(row, column, *cell):
+                    return cell
         return None
 
     def _open(self, row: int, column: int, r: int, c: int) -> bool:

@@ -47,7 +47,9 @@ from services.irm.window import Window, build_window, grid_of, read_layer, windo
 __all__ = ["Config", "IrmStage", "create", "spec"]
 
 _BLOCKED_AGAIN_NS = 5 * SECOND_NS
-"""Blocked at one place again after so long, it counts once more."""
+"""Blocked at one place again after so long, it counts once more,"""
+_BLOCKED_MOST = 2
+"""and so often at most: a door that was touched is risky, not shut."""
 _DOUBT_WINDOWS = 1.25
 """Keyframes within so many widths of the window are asked for their certainty: what they saw may lie in it."""
 _MAX_PENDING = 50
@@ -161,8 +163,8 @@ class IrmStage:
         if follower is None or not (follower.blocked or follower.stuck):
             return
         ahead = planar(odometry.pose).apply(0.5, 0.0)
-        lately = [p for p in self._penalties if now - p[0] < _BLOCKED_AGAIN_NS]
-        if all(math.dist(ahead, p[1:]) > 0.3 for p in lately):  # again and again: worse and worse
+        here = [p for p in self._penalties if math.dist(ahead, p[1:]) <= 0.3]
+        if len(here) < _BLOCKED_MOST and all(now - p[0] >= _BLOCKED_AGAIN_NS for p in here):
             self._penalties.append((now, *ahead))
 
     def _add_scans(self, risk: RiskMap, odometry: Odometry) -> None:

@@ -197,15 +197,17 @@ class LcpStage:
         to_odom = planar(policy.map_to_odom).inverse()
         places = [to_odom.apply(float(x), float(y)) for x, y, _ in policy.path_xyz_m]
         p = parameters(self._config.weights)
-        for x, y in reversed(_densify(places)):
-            node = node_at(irm, x, y)
-            if node < 0 or irm.state[node] != 1 or node == junction.node:
-                continue
-            moves = moves_to(irm, junction.node, node, p.k_risk, _MAX_RISK)
-            if moves:
-                reason = f"guides to target {policy.target}"
-                return _policy(now, request, irm, LocalPhase.GUIDE, reason, policy, junction, moves, 0,
-                               _EMPTY_TREE, policy.target_q, 0, 0)  # fmt: skip
+        # A way that is riskier than any other planner would take is still better than to stand in a pocket.
+        for max_risk in (_MAX_RISK, 1.0):
+            for x, y in reversed(_densify(places)):
+                node = node_at(irm, x, y)
+                if node < 0 or irm.state[node] != 1 or node == junction.node:
+                    continue
+                moves = moves_to(irm, junction.node, node, p.k_risk, max_risk)
+                if moves:
+                    reason = f"guides to target {policy.target}"
+                    return _policy(now, request, irm, LocalPhase.GUIDE, reason, policy, junction, moves, 0,
+                                   _EMPTY_TREE, policy.target_q, 0, 0)  # fmt: skip
         return _nothing(now, request, f"no way to target {policy.target} in the Local IRM")
 
     def snapshot(self) -> bytes:

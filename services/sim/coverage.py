@@ -108,7 +108,8 @@ class Judge:
         self.occupied = cut(occupied, self._cuts)
         self.reachable = reachable
         self._reachable_cells = int(np.count_nonzero(reachable))
-        self.set_covered(self.covered)
+        self._count(self.covered)
+        self._told &= reachable
 
     @property
     def coverage_fraction(self) -> float:
@@ -129,10 +130,13 @@ class Judge:
         """Take over a coverage mask (from a snapshot). Raises ValueError if its shape differs."""
         if covered.shape != self.spec.shape:
             raise ValueError(f"coverage mask of shape {covered.shape}, need {self.spec.shape}")
+        self._count(covered)
+        self._told, self._box = self.covered.copy(), None
+
+    def _count(self, covered: NDArray[np.bool_]) -> None:
         self.covered = covered & self.reachable
         self._pending = self.reachable & ~self.covered
         self._covered_cells = int(np.count_nonzero(self.covered))
-        self._told, self._box = self.covered.copy(), None
 
     def take_news(self) -> NDArray[np.int64]:
         """Flat indices of the cells covered since the last call: for the journal. Looks only where the robot was."""

@@ -233,6 +233,7 @@ class SimStage:
         return PointCloud(
             stamp_ns=now,
             sensor_in_odom=self._pose(lidar.height_m),
+            sensor_in_base=Pose(z_m=lidar.height_m),
             ground_z_m=state.z_m,
             range_m=lidar.range_m,
             points_m=points_m,

@@ -93,6 +93,17 @@ def test_a_frame_without_keyframes_or_that_never_agrees_is_taken_as_told() -> No
     assert frame.update(IDENTITY, 3 * SECOND_NS, known=True) == IDENTITY
 
 
+def test_a_graph_that_comes_late_does_not_move_the_frame_a_second_time() -> None:
+    frame, closed, again = OdomInMap(), Planar(2.0, 1.0, 0.1), Planar(0.5, 0.0, 0.0)
+    frame.update(IDENTITY, 0, known=True)
+    frame.update(closed, SECOND_NS, known=True)
+    assert frame.update(closed, 3 * SECOND_NS, known=True) == closed, "waited for, then taken as told"
+    frame.follow(closed)
+    assert frame.update(closed, 4 * SECOND_NS, known=True) == closed
+    frame.follow(again)
+    assert frame.update(again.compose(closed), 5 * SECOND_NS, known=True) == again.compose(closed)
+
+
 @given(st.floats(0.0, 20.0), st.floats(0.1, 2.0))
 def test_the_blur_begins_at_its_bound_and_has_an_end(deviation_m: float, from_m: float) -> None:
     level = blur_level(deviation_m, from_m)

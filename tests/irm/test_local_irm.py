@@ -154,6 +154,36 @@ def test_rooms_are_joined_through_their_door_only() -> None:
         assert len(inside) and (np.abs(inside[:, 1]) < 0.4).all()
 
 
+def _parts(irm: LocalIrm) -> set[frozenset[int]]:
+    """The connected components of the traversable nodes."""
+    parts: dict[int, set[int]] = {int(node): {int(node)} for node in np.flatnonzero(irm.state == 1)}
+    for node, k in np.argwhere(irm.edge_distance_m > 0):
+        a = int(node)
+        b = a + int(DIRECTION_DY[k]) * irm.size + int(DIRECTION_DX[k])
+        if parts[a] is not parts[b]:
+            parts[a] |= parts[b]
+            for member in parts[b]:
+                parts[member] = parts[a]
+    return {frozenset(part) for part in parts.values()}
+
+
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10_000))
+def test_the_lattice_does_not_fall_apart_for_want_of_a_long_way_round(seed: int) -> None:
+    """However short edges are wanted, what can be joined by a longer one is joined."""
+    flat = cluttered(seed, boxes=14)
+    belief = Belief.new(CONFIG, RES)
+    window = belief.window(flat.risk_map(), 0.0, 0.0)
+    strict, lax = (
+        LocalIrmBuilder(CONFIG.model_copy(update={"edge_detour": d}), RADIUS_M).build(
+            window, Pose(), Pose(), 1
+        )
+        for d in (0.01, 1e3)
+    )
+    assert _parts(strict) == _parts(lax)
+    assert (strict.edge_distance_m > 0).sum() <= (lax.edge_distance_m > 0).sum()
+
+
 def test_a_closed_door_parts_the_lattice() -> None:
     irm, _, _ = build(two_rooms(0.0), -1.5, 0.0)
     right = irm.anchor_m[:, 0] > 0.2

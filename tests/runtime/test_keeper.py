@@ -151,6 +151,16 @@ def test_a_state_that_no_life_survives_is_not_restored_for_ever(tmp_path: Path) 
     assert counts == [4, 7, 7, 9, 0]
 
 
+def test_after_a_state_was_given_up_the_next_life_goes_on_from_what_came_since(tmp_path: Path) -> None:
+    """Three deaths at a start cost the state once, not at every later death."""
+    for steps in (50, 1, 1, 1, 60):
+        keeper = _keeper(tmp_path, Watch())
+        stage = keeper.recover(Counter, 0)
+        _live(keeper, stage, steps)
+    assert stage.count == 60, "given up: as new"
+    assert _keeper(tmp_path, Watch()).recover(Counter, 0).count == 60
+
+
 def test_the_journal_of_a_mission_that_began_later_is_not_used(tmp_path: Path) -> None:
     keeper, stage = _keeper(tmp_path, Watch()), Counter()
     keeper.recover(lambda: stage, 1000)

@@ -126,3 +126,14 @@ def test_a_start_without_room_is_refused() -> None:
     world = with_walls(box(4.0, 4.0), (2.2, 0.0, 2.4, 4.0), (1.6, 0.0, 1.8, 4.0))
     with pytest.raises(StartError, match="does not fit"):
         Judge(world, 0.335, SENSOR)
+
+
+def test_what_was_covered_before_a_door_closed_is_news_for_the_journal_all_the_same() -> None:
+    world = box(4.0, 4.0)
+    judge = Judge(world, 0.2, SENSOR)
+    judge.update(2.0, 2.0, 0.0)
+    covered = judge.covered.copy()
+    judge.take_over(world.occupied, judge.reachable)
+    assert covered.any()
+    assert set(judge.take_news().tolist()) == set(np.flatnonzero(covered).tolist())
+    assert judge.take_news().size == 0
