@@ -99,7 +99,7 @@ class FrontierManager:
 
         robot: its place in `map`. elapsed_s: since the last call; ground_m2: known so far; anchor: the keyframe that
         the robot is at; doubtful: keyframes whose place relative to it is not known well. What belongs to them is not
-        in the window for certain, and is left as it is.
+        in the window for certain, and is left as it is until the robot gets there.
         """
         self._doubtful = doubtful
         next_id = self._second_chances(next_id)
@@ -127,13 +127,23 @@ class FrontierManager:
         return next_id
 
     def near(self, window: Window) -> list[int]:
-        """The frontiers that lie in the window."""
+        """The frontiers that lie in the window, those of doubtful place only when the robot is beside them.
+
+        There it sees what is open, wherever exactly; else it would wait for ever beside what is not there.
+        """
         s = window.spec
         x, y = window.to_map(*s.centre_of(s.height // 2, s.width // 2))
         radius = 0.5 * math.hypot(s.height + 2, s.width + 2) * s.resolution_m
         around = (k for k in self._places.around(x, y, radius) if k in self.frontiers)
         inside = [k for k in around if _in_window(window, self.frontiers[k])]
-        return [k for k in inside if self.frontiers[k].keyframe not in self._doubtful]
+        if not self._doubtful:
+            return inside
+        robot = window.to_map(*s.centre_of(*window.robot_cell))
+        return [k for k in inside if self._can_judge(self.frontiers[k], robot)]
+
+    def _can_judge(self, frontier: Frontier, robot: tuple[float, float]) -> bool:
+        away_m = math.hypot(frontier.x_m - robot[0], frontier.y_m - robot[1])
+        return frontier.keyframe not in self._doubtful or away_m <= self.config.opening_range_m
 
     def take_changes(self) -> set[int]:
         """Ids of the frontiers that are new, other than before or gone since the last call."""

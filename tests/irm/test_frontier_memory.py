@@ -113,6 +113,19 @@ def test_an_opening_that_the_robot_fits_is_a_frontier_however_large_the_world(
     assert len(scene.round(ground_m2=1e5)) == found
 
 
+def test_frontiers_of_doubtful_place_are_judged_when_the_robot_is_beside_them() -> None:
+    scene = Scene(covered_to_m=2.0, opening_range_m=5.0, missed_rounds=2)
+    scene.round()
+    name, place = scene.only().node_id, (scene.only().x_m, scene.only().y_m)
+    scene.only().keyframe = 7
+    scene.belief.cover(scene.flat.spec, scene.flat.state == FREE)
+    for robot, kept in ((ROBOT, True), ((place[0] - 3.0, 2.5), False)):
+        window = scene.belief.window(scene.flat.risk_map(), *robot)
+        for k in range(4):
+            scene.manager.update(window, robot, k * SECOND, 1.0, 99, doubtful=frozenset({7}))
+        assert (name in scene.manager.frontiers) is kept
+
+
 def test_openings_are_looked_for_near_the_robot_and_kept_when_it_goes() -> None:
     """Far walls seen at a slant are full of holes; an opening seen from near by is one."""
     scene = Scene(opening_range_m=5.0)
