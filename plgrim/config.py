@@ -212,10 +212,10 @@ def environment_overrides(environment: Mapping[str, str]) -> dict[str, str]:
         name = variable.removeprefix(PREFIX)
         if name in _SHORT:
             found[variable] = _SHORT[name]
-        elif "__" in name or name.lower() in ("robot", "seed"):
+        elif "__" in name or name.lower() in ("robot", "seed", "profile"):
             found[variable] = name.lower().replace("__", ".")
         else:
-            check_env_name(variable, ("ROBOT", "SEED", *_SHORT))
+            check_env_name(variable, ("ROBOT", "SEED", "PROFILE", *_SHORT))
     return found
 
 

@@ -165,3 +165,12 @@ def test_rough_ground_gets_the_terrain_model_and_a_lidar_that_looks_down(
     config = load_config(None, {"sim": sim})
     assert RiskMap.model_validate(config.options("riskmap")).model == model
     assert SimConfig.model_validate(config.options("sim")).lidar.elevation_min_deg == lowest_deg
+
+
+def test_the_environment_names_the_robots_profile(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PLGRIM_PROFILE", "husky")
+    assert load_config(None, {}).options("riskmap")["profile"] == "husky"
+    monkeypatch.delenv("PLGRIM_PROFILE")
+    monkeypatch.setenv("PLGRIM_PROFIL", "husky")
+    with pytest.raises(ConfigError, match="PLGRIM_PROFILE"):
+        load_config(None, {})
