@@ -68,8 +68,6 @@ class GcpStage:
         self._asked_ns = -1
         self._frame = Pose()
         """Of `odom` in the `map` that the graph is in: at a closure that of the odometry is ahead of the graph."""
-        self._frame = Pose()
-        """Of `odom` in the `map` that the graph is in: at a closure that of the odometry is ahead of the graph."""
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One step: the global policy, and a request for the graph when a difference was missed."""

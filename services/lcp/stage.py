@@ -97,19 +97,14 @@ class LcpStage:
             junction = junction_of(request, irm)
         except ValueError as error:
             return _nothing(now, request, str(error))
-        entropy = self._wanted_entropy(now, irm)
-        if not returning and self._should_cover(irm, junction, entropy, policy):
-            return self._cover(now, request, irm, junction, entropy, policy)
-        return self._guide(now, request, irm, junction, policy)
-
-    def _wanted_entropy(self, now: Stamp, irm: LocalIrm) -> np.ndarray:
-        """Entropy of what can be covered in this window, without the patches that are left alone. (n,)"""
         entropy = local_entropy(irm)
-        here = indexed(irm, entropy)
-        for ix, iy in self._promises.left_alone(now, here):
-            if (ix, iy) in here:
-                entropy[_node(irm, (ix, iy))] = 0.0
-        return entropy
+        uncovered = indexed(irm, entropy)
+        for index in self._promises.left_alone(now, uncovered):
+            if index in uncovered:
+                entropy[_node(irm, index)] = 0.0
+        if not returning and self._should_cover(irm, junction, entropy, policy):
+            return self._cover(now, request, irm, junction, entropy, uncovered, policy)
+        return self._guide(now, request, irm, junction, policy)
 
     def _should_cover(
         self, irm: LocalIrm, junction: Junction, entropy: np.ndarray, policy: GlobalPolicy | None
@@ -142,8 +137,10 @@ class LcpStage:
         irm: LocalIrm,
         junction: Junction,
         entropy: np.ndarray,
+        uncovered: dict[Index, float],
         policy: GlobalPolicy | None,
     ) -> LocalPolicy:
+        """Phase 2. entropy: without the patches that are left alone; uncovered: with them."""
         leaf = leaf_values(irm, policy, self._config.weights)
         counted = leftover_entropy(entropy, irm.state == 1, irm.size, self._config.weights)
         model = coverage_model(irm, counted, leaf, junction, self._config)
@@ -170,8 +167,7 @@ class LcpStage:
         )
         reason = f"covers: value {root.best_value:.2f} by {report.simulations} simulations"
         soon = covered_by(model, junction.node, junction.heading, moves[: self._config.promise_moves])
-        here = indexed(irm, local_entropy(irm))
-        self._promises.note(now, (index for index in here if soon[_node(irm, index)]), here)
+        self._promises.note(now, (index for index in uncovered if soon[_node(irm, index)]), uncovered)
         terms = step_terms(model, junction.node, junction.heading, moves)
         return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, moves, in_tree, tree,
                        float(root.best_value), report.simulations, report.nodes, float(rollout), terms)  # fmt: skip
