@@ -133,34 +133,25 @@ def _fit_planes(
     rows, columns = height_m.shape
     reach = spans.shape[0] // 2
     full = float((2 * spans + 1).sum())
-    # Sums over the columns to the left of: number, w, w x, w xx, w z, w xz, w zz, w variance.
-    sums = np.zeros((rows, columns + 1, 8))
-    for r in range(rows):
-        for c in range(columns):
-            for q in range(8):
-                sums[r, c + 1, q] = sums[r, c, q]
-            if known[r, c]:
-                w = _WEIGHT_VARIANCE / (variance[r, c] + _WEIGHT_VARIANCE)
-                x, z = c * resolution_m, float(height_m[r, c])
-                sums[r, c + 1, 0] += 1.0
-                sums[r, c + 1, 1] += w
-                sums[r, c + 1, 2] += w * x
-                sums[r, c + 1, 3] += w * x * x
-                sums[r, c + 1, 4] += w * z
-                sums[r, c + 1, 5] += w * x * z
-                sums[r, c + 1, 6] += w * z * z
-                sums[r, c + 1, 7] += w * variance[r, c]
-    part = np.zeros(8)
-    for r in range(rows):
+    # Of the rows in reach, sums over the columns to the left of: number, w, w x, w xx, w z, w xz, w zz, w variance.
+    band = 2 * reach + 1
+    sums = np.zeros((band, columns + 1, 8))
+    part, slots = np.zeros(8), np.zeros(band, dtype=np.int64)
+    for r in range(-reach, rows):
+        if r + reach < rows:
+            _sum_row(height_m[r + reach], variance[r + reach], known[r + reach], resolution_m, sums[(r + reach) % band])
+        if r < 0:
+            continue
+        for k in range(band):
+            slots[k] = (r - reach + k) % band
+        low, high = max(-reach, -r), min(reach, rows - 1 - r)
         for c in range(columns):
             if not known[r, c]:
                 continue
             n = s = sx = sy = sz = sxx = sxy = syy = sxz = syz = szz = sv = 0.0
             x0 = c * resolution_m
-            for k in range(-reach, reach + 1):
-                row = r + k
-                if row < 0 or row >= rows:
-                    continue
+            for k in range(low, high + 1):
+                row = slots[k + reach]
                 left = max(0, c - spans[k + reach])
                 right = min(columns, c + spans[k + reach] + 1)
                 for q in range(8):
@@ -201,6 +192,32 @@ def _fit_planes(
             out[1, r, c] = (own + residual / n) / (least * shrink) / (1.0 + steepness * steepness) ** 2
             out[2, r, c] = math.sqrt(residual)
             out[3, r, c] = own
+
+
+@njit
+def _sum_row(
+    height_m: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    known: NDArray[np.bool_],
+    resolution_m: float,
+    sums: NDArray[np.float64],
+) -> None:
+    """The running sums of one row for `_fit_planes`: (columns + 1, 8), the first of them zeros."""
+    n = s = sx = sxx = sz = sxz = szz = sv = 0.0
+    for c in range(known.shape[0]):
+        if known[c]:
+            w = _WEIGHT_VARIANCE / (variance[c] + _WEIGHT_VARIANCE)
+            x, z = c * resolution_m, float(height_m[c])
+            n += 1.0
+            s += w
+            sx += w * x
+            sxx += w * x * x
+            sz += w * z
+            sxz += w * x * z
+            szz += w * z * z
+            sv += w * variance[c]
+        row = sums[c + 1]
+        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7] = n, s, sx, sxx, sz, sxz, szz, sv
 
 
 @njit
