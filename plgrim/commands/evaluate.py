@@ -1,0 +1,16 @@
+"""`plgrim evaluate ...`: experiments, each with figures and tables as its result."""
+
+from __future__ import annotations
+
+import typer
+
+from plgrim.commands import evaluate_missions
+
+
+def register(app: typer.Typer) -> None:
+    """Add the group of commands."""
+    group = typer.Typer(
+        name="evaluate", help="Experiments: campaigns of missions, and what they show.", no_args_is_help=True
+    )
+    evaluate_missions.register(group)
+    app.add_typer(group)
