@@ -22,8 +22,11 @@ Mask = NDArray[np.bool_]
 
 MARGIN_M = 0.4
 """From the rim of the ground; ways nearer to it cost more."""
-_RIM_COST = 2.0
-"""Further metres that a metre along the rim itself counts as."""
+_LEAST_MARGIN_M = 0.1
+_RIM_COST = 1.5
+"""A metre of way counts as this times (`MARGIN_M` / margin - 1) metres more: at half the margin, so much."""
+_DEAREST = 1.0 + _RIM_COST * (MARGIN_M / _LEAST_MARGIN_M - 1.0)
+"""Metres that a metre counts as at most."""
 _SPAN = 400
 """Most cells that a straightened piece of a way replaces."""
 _TOLERANCE = 0.002
@@ -40,11 +43,16 @@ class KnownGround:
         margin = ndimage.distance_transform_edt(np.pad(roamed, 1))[1:-1, 1:-1] * spec.resolution_m
         self.margin_m: NDArray[np.float32] = margin.astype(np.float32)
         """From each cell to the nearest where the middle may not be, m; 0 there."""
-        rim = _RIM_COST * np.maximum(0.0, 1.0 - margin / MARGIN_M)
+        rim = _RIM_COST * np.maximum(0.0, MARGIN_M / np.maximum(margin, _LEAST_MARGIN_M) - 1.0)
         self._rim_cost: NDArray[np.float32] = rim.astype(np.float32)
         self._cost: NDArray[np.float32] = (1.0 + rim).astype(np.float32)
         self._found = np.empty(spec.shape, np.float64)
         self._parent = np.empty(spec.shape, np.int32)
+
+    def without(self, x_m: float, y_m: float, radius_m: float) -> KnownGround:
+        """The ground less a disc: ways lead around it, where they can."""
+        x, y = self.spec.centres_x(), self.spec.centres_y()[:, None]
+        return KnownGround(self.spec, self.roamed & (np.hypot(x - x_m, y - y_m) > radius_m))
 
     def places(self, spacing_m: float) -> NDArray[np.int64]:
         """One cell of each square of `spacing_m` that holds ground: clear of the rim, then near the square's middle.
@@ -139,7 +147,7 @@ class KnownGround:
                 self._join(cells, place, reach_m, edges)
             graph = _symmetric(edges, len(cells))
             count, part = csgraph.connected_components(graph, directed=False)
-            if count == 1 or reach_m > self.spec.resolution_m * sum(self.spec.shape) * (1.0 + _RIM_COST):
+            if count == 1 or reach_m > self.spec.resolution_m * sum(self.spec.shape) * _DEAREST:
                 return graph
             main = int(np.argmax(np.bincount(part)))
             lonely = np.flatnonzero(part != main)

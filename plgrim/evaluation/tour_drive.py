@@ -19,7 +19,9 @@ from plgrim.evaluation.viewpoints import Tell
 from services.sim.config import SimConfig
 from services.sim.coverage import Judge
 from services.sim.follower import Follower, TimedPath
+from services.sim.geometry import clearance
 from services.sim.robot import Robot
+from services.sim.terrain import body_solid
 from services.sim.world import World
 
 TICK_S = 0.05
@@ -28,6 +30,10 @@ _PIECE_M = 0.2
 """Speeds are set at points so far apart at most."""
 _HELD_S = 1.5
 """Against a wall for so long: another way."""
+_AVOID_M = 0.4
+"""So far around the place where it was held."""
+_TIGHT_M, _NUDGE_M, _NUDGES = 0.15, 0.01, 10
+"""With less room than this beside the footprint, ways are moved to the middle, in so many steps of so much at most."""
 _PATIENCE_S = 120.0
 """For a stretch, beyond three times what its length takes at walking pace."""
 
@@ -61,6 +67,7 @@ class _Drive:
         self._robot = Robot(world, ideal, stream(0, "tour"))
         self._follower = Follower(config.robot)
         self._judge, self._ground, self._config = judge, ground, config
+        self._world, self._solid = world, body_solid(world, config.robot.height_m)
         self.rows: list[tuple[float, float, float, float, float]] = []
         self.tick, self.length_m = 0, 0.0
         judge.set_covered(np.zeros(judge.spec.shape, np.bool_))
@@ -89,7 +96,7 @@ class _Drive:
 
     def follow(self, stretch: Stretch, until_s: float) -> bool:
         """Drive along a stretch to its end; False: held, lost, or out of time."""
-        points = _subdivided(stretch.points_m)
+        points = self._centred(_subdivided(stretch.points_m))
         self._follower.set_path(self._path(points, stretch.yaw_rad))
         length = float(np.hypot(*np.diff(points, axis=0).T).sum()) if len(points) > 1 else 0.0
         give_up_s = min(until_s, self.now_s + _PATIENCE_S + 3.0 * length)
@@ -123,10 +130,43 @@ class _Drive:
         speed = speed_limit_mps(self._ground.margin_at(points), self._config.robot.max_speed_mps)
         return TimedPath(points[:, 0], points[:, 1], yaw, speed, np.zeros(len(points)), 0.0, 1e9)
 
-    def way_to(self, points: Points) -> Points:
-        """From where the robot stands to the end of a stretch."""
-        row, column = self._ground.nearest_cell(*points[-1].tolist())
-        return self._ground.way(self.at, (row, column))[0]
+    def _centred(self, points: Points) -> Points:
+        """The points, those in tight places moved away from the nearest wall: cells are too coarse for the middle."""
+        points, cell = points.copy(), self._world.spec.resolution_m
+        wide = self._config.robot.footprint_radius_m + _TIGHT_M
+        for k in np.flatnonzero(self._ground.margin_at(points) < wide).tolist():
+            at = self._world.to_cells(*points[k].tolist())
+            room, near_x, near_y = clearance(self._solid, *at, wide / cell + 1.0)
+            for _ in range(_NUDGES):
+                away = math.hypot(at[0] - near_x, at[1] - near_y)
+                if room * cell >= wide or away < 1e-6:
+                    break
+                step = _NUDGE_M / cell / away
+                moved = (at[0] + step * (at[0] - near_x), at[1] + step * (at[1] - near_y))
+                found = clearance(self._solid, *moved, wide / cell + 1.0)
+                if found[0] <= room:
+                    break
+                at, (room, near_x, near_y) = moved, found
+            spec = self._world.spec
+            points[k] = (at[0] + spec.ix0) * cell, (at[1] + spec.iy0) * cell
+        return points
+
+    def rejoin(self, stretch: Stretch, until_s: float) -> bool:
+        """Drive to the beginning of a stretch and along it; False: held, lost, out of time, or there is no way."""
+        points = self.way_to(stretch.points_m[0])
+        if points is None:
+            return False
+        return self.follow(Stretch(np.concatenate([points, stretch.points_m[1:]]), stretch.yaw_rad), until_s)
+
+    def avoid_this(self) -> None:
+        """Take the place where the robot stands for impassable."""
+        self._ground = self._ground.without(*self.at, _AVOID_M)
+
+    def way_to(self, point: Points) -> Points | None:
+        """From where the robot stands to a point (2,); None: there is none."""
+        row, column = self._ground.nearest_cell(*point.tolist())
+        points, cost = self._ground.way(self.at, (row, column))
+        return points if math.isfinite(cost) else None
 
 
 def _subdivided(points: Points) -> Points:
@@ -151,18 +191,15 @@ def drive_tour(
 ) -> Driven:
     """Drive so long, or to the tour's end. The judge begins with nothing covered."""
     drive = _Drive(world, config, judge, ground)
-    skipped, told_s = 0, 0.0
-    reached = True
+    skipped, told_s, held = 0, 0.0, False
     for stretch in stretches:
-        points = stretch.points_m
-        if not reached:  # the last stretch was given up: from here, not from its end
-            points = np.concatenate([drive.way_to(points[:1]), points[1:]])
-        reached = drive.follow(Stretch(points, stretch.yaw_rad), time_s)
-        if not reached and not drive.lost_reason and drive.now_s < time_s:
-            reached = drive.follow(Stretch(drive.way_to(points), stretch.yaw_rad), time_s)
-            skipped += not reached
+        held = not (drive.rejoin(stretch, time_s) if held else drive.follow(stretch, time_s))
         if drive.lost_reason or drive.now_s >= time_s:
             break
+        if held:
+            drive.avoid_this()
+            held = not drive.rejoin(Stretch(stretch.points_m[-1:], stretch.yaw_rad), time_s)
+            skipped += held
         if drive.now_s - told_s > 300.0:
             told_s = drive.now_s
             tell(f"driven {drive.now_s:.0f} s: {judge.covered_area_m2:.0f} m2 covered")
