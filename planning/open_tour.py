@@ -109,7 +109,7 @@ def _or_opt_pass(distance: Distances, order: NDArray[np.int64]) -> int:
                     one += np.float64(distance[last, right]) - np.float64(distance[left, right])
                     other += np.float64(distance[first, right]) - np.float64(distance[left, right])
                 if saved - min(one, other) > best:
-                    best, best_at, turned = saved - min(one, other), k, other < one
+                    best, best_at, turned = saved - min(one, other), k, bool(other < one)
             if best_at >= 0:
                 _move_piece(order, i, length, best_at, turned)
                 moves += 1

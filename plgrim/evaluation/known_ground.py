@@ -54,6 +54,11 @@ class KnownGround:
         x, y = self.spec.centres_x(), self.spec.centres_y()[:, None]
         return KnownGround(self.spec, self.roamed & (np.hypot(x - x_m, y - y_m) > radius_m))
 
+    def part_with(self, x_m: float, y_m: float) -> KnownGround:
+        """The 4-connected part of the ground that holds the cell nearest to a point."""
+        parts, _ = ndimage.label(self.roamed)
+        return KnownGround(self.spec, parts == parts[self.nearest_cell(x_m, y_m)])
+
     def places(self, spacing_m: float) -> NDArray[np.int64]:
         """One cell of each square of `spacing_m` that holds ground: clear of the rim, then near the square's middle.
 
@@ -138,7 +143,7 @@ class KnownGround:
     # --- distances --------------------------------------------------------------------------------------------
 
     def roadmap(self, cells: NDArray[np.int64], spacing_m: float) -> sparse.csr_array:
-        """Ways between neighbouring cells (n, 2) `spacing_m` apart, as costs in metres: a connected graph of n nodes."""
+        """Ways between neighbouring cells (n, 2) `spacing_m` apart, as costs in metres: a connected graph, n nodes."""
         edges: dict[tuple[int, int], float] = {}
         lonely = np.arange(len(cells))
         reach_m = _NEIGHBOURS_WITHIN * spacing_m
@@ -160,9 +165,7 @@ class KnownGround:
         row, column = int(cells[place, 0]), int(cells[place, 1])
         reach = math.ceil(reach_m / self.spec.resolution_m)
         box = (row - reach, row + reach + 1, column - reach, column + reach + 1)
-        near = np.flatnonzero(
-            (np.abs(cells[:, 0] - row) <= reach) & (np.abs(cells[:, 1] - column) <= reach)
-        )
+        near = np.flatnonzero((np.abs(cells[:, 0] - row) <= reach) & (np.abs(cells[:, 1] - column) <= reach))
         dijkstra_box(
             self._cost, self.roamed, self.spec.resolution_m, row, column, box,
             cells[near].astype(np.int32), reach_m, self._found, self._parent,

@@ -6,6 +6,7 @@ those of the robot, slopes slow it as they slow any, and ground that breaks robo
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 from planning.randomness import stream
 from plgrim.evaluation.known_ground import KnownGround, Points
 from plgrim.evaluation.tour_plan import Stretch, speed_limit_mps
-from plgrim.evaluation.viewpoints import Tell
 from services.sim.config import SimConfig
 from services.sim.coverage import Judge
 from services.sim.follower import Follower, TimedPath
@@ -30,8 +30,8 @@ _PIECE_M = 0.2
 """Speeds are set at points so far apart at most."""
 _HELD_S = 1.5
 """Against a wall for so long: another way."""
-_AVOID_M = 0.4
-"""So far around the place where it was held."""
+_AVOID_M = 0.3
+"""Radius of the disc before the robot, where it was held, that ways then avoid."""
 _TIGHT_M, _NUDGE_M, _NUDGES = 0.15, 0.01, 10
 """With less room than this beside the footprint, ways are moved to the middle, in so many steps of so much at most."""
 _PATIENCE_S = 120.0
@@ -159,8 +159,10 @@ class _Drive:
         return self.follow(Stretch(np.concatenate([points, stretch.points_m[1:]]), stretch.yaw_rad), until_s)
 
     def avoid_this(self) -> None:
-        """Take the place where the robot stands for impassable."""
-        self._ground = self._ground.without(*self.at, _AVOID_M)
+        """Take the place before the robot for impassable."""
+        x_m, y_m, yaw_rad = self._robot.state[:3]
+        ahead_x, ahead_y = x_m + _AVOID_M * math.cos(yaw_rad), y_m + _AVOID_M * math.sin(yaw_rad)
+        self._ground = self._ground.without(ahead_x, ahead_y, _AVOID_M)
 
     def way_to(self, point: Points) -> Points | None:
         """From where the robot stands to a point (2,); None: there is none."""
@@ -172,7 +174,7 @@ class _Drive:
 def _subdivided(points: Points) -> Points:
     """The same way with points at most `_PIECE_M` apart, none twice in a row."""
     found = [points[:1]]
-    for a, b in zip(points[:-1], points[1:], strict=True):
+    for a, b in itertools.pairwise(points):
         length = float(np.hypot(*(b - a)))
         if length > 1e-6:
             share = np.arange(1, math.ceil(length / _PIECE_M) + 1) / math.ceil(length / _PIECE_M)
@@ -187,11 +189,10 @@ def drive_tour(
     ground: KnownGround,
     stretches: list[Stretch],
     time_s: float,
-    tell: Tell,
 ) -> Driven:
     """Drive so long, or to the tour's end. The judge begins with nothing covered."""
     drive = _Drive(world, config, judge, ground)
-    skipped, told_s, held = 0, 0.0, False
+    skipped, held = 0, False
     for stretch in stretches:
         held = not (drive.rejoin(stretch, time_s) if held else drive.follow(stretch, time_s))
         if drive.lost_reason or drive.now_s >= time_s:
@@ -200,12 +201,13 @@ def drive_tour(
             drive.avoid_this()
             held = not drive.rejoin(Stretch(stretch.points_m[-1:], stretch.yaw_rad), time_s)
             skipped += held
-        if drive.now_s - told_s > 300.0:
-            told_s = drive.now_s
-            tell(f"driven {drive.now_s:.0f} s: {judge.covered_area_m2:.0f} m2 covered")
-    columns = np.array(drive.rows).T
+    time, covered, x, y, yaw = np.array(drive.rows).T
     return Driven(
-        *columns,
+        time,
+        covered,
+        x,
+        y,
+        yaw,
         drive.length_m,
         drive.contacts,
         skipped,

@@ -1,4 +1,4 @@
-"""A tour by a planner that knows the map: viewpoints, their order, and the way past them, rehearsed by the judge's sight.
+"""A tour by a planner that knows the map: viewpoints, their order, and the way past them, by the judge's sight.
 
 A round picks viewpoints for all that is not yet covered (greedy set cover), orders them (nearest neighbour, 2-opt) and
 walks the order in rehearsal. As the map is known, so is what a place would still add: a viewpoint whose ground has been
@@ -89,7 +89,9 @@ def speed_limit_mps(margin_m: NDArray[np.float64], max_speed_mps: float) -> NDAr
 class TourPlanner:
     """Plans tours in one world. Holds a judge, whose coverage a rehearsal uses up and a drive may use after it."""
 
-    def __init__(self, world: World, config: SimConfig, judge: Judge, ground: KnownGround, tell: Tell) -> None:
+    def __init__(
+        self, world: World, config: SimConfig, judge: Judge, ground: KnownGround, tell: Tell
+    ) -> None:
         self._judge, self.ground, self._tell = judge, ground, tell
         self._start = world.start
         self._robot = config.robot
@@ -140,7 +142,8 @@ class TourPlanner:
         passes = improve_tour(distance, order, _PASSES)
         after_m = tour_length(distance, order)
         self._tell(
-            f"{len(places)} viewpoints: nearest neighbour {before_m:.0f} m, after {passes} passes of 2-opt {after_m:.0f} m"
+            f"{len(places)} viewpoints: nearest neighbour {before_m:.0f} m, "
+            f"after {passes} passes of 2-opt {after_m:.0f} m"
         )
         return [viewpoints[k - 1] for k in order[1:].tolist()], before_m, after_m
 

@@ -47,7 +47,7 @@ def views(judge: Judge, points: Points, tell: Tell) -> list[Cells]:
         flat = (rows + window[0].start) * pending.shape[1] + columns + window[1].start
         pending.reshape(-1)[flat], seen.reshape(-1)[flat] = True, False
         found.append(flat.astype(np.int64))
-        if k % 500 == 499:
+        if k % 2000 == 1999:
             tell(f"lines of sight from {k + 1} of {len(points)} places")
     return found
 

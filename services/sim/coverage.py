@@ -112,7 +112,14 @@ class Judge:
             return look(self.occupied, pending, seen, view, self._range_cells, cos_half_fov)
         view = np.append(view, height_at(self._floor_m, x, y) + self._sensor_height_m)
         return look_over(
-            self.occupied, self._floor_m, self._ceiling_m, pending, seen, view, self._range_cells, cos_half_fov
+            self.occupied,
+            self._floor_m,
+            self._ceiling_m,
+            pending,
+            seen,
+            view,
+            self._range_cells,
+            cos_half_fov,
         )
 
     def close(self, occupied: NDArray[np.bool_], robot_m: tuple[float, float]) -> None:
