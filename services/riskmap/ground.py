@@ -369,7 +369,10 @@ def _along_gap(
         if row < 0 or row >= height or column < 0 or column >= width:
             return
         row, column = row + rules.row0, column + rules.column0
-        row, column = (row - height if row >= height else row), (column - width if column >= width else column)
+        row, column = (
+            (row - height if row >= height else row),
+            (column - width if column >= width else column),
+        )
         if far - r > res:
             known = cells[row, column, VARIANCE] > 0.0
             if known or bounds:

@@ -139,7 +139,13 @@ def _fit_planes(
     part, slots = np.zeros(8), np.zeros(band, dtype=np.int64)
     for r in range(-reach, rows):
         if r + reach < rows:
-            _sum_row(height_m[r + reach], variance[r + reach], known[r + reach], resolution_m, sums[(r + reach) % band])
+            _sum_row(
+                height_m[r + reach],
+                variance[r + reach],
+                known[r + reach],
+                resolution_m,
+                sums[(r + reach) % band],
+            )
         if r < 0:
             continue
         for k in range(band):
