@@ -80,7 +80,7 @@ def _run(campaign: Any, out: Path, jobs: int, force: bool) -> None:
     console = Console()
     with stop_on_signals() as stop, CampaignDisplay(console) as display:
         outcome = run_campaign(campaign, out, jobs, display, stop, force)
-    console.print(f"results in {out}/: runs.csv, runs/", highlight=False)
+    console.print(f"results in {out}/: summary.md, runs.csv, coverage.png, runs/", highlight=False)
     for name in outcome.crashed:
         console.print(f"crashed: {name}: see {out}/runs/{name}/run.log", highlight=False, soft_wrap=True)
     if not outcome.complete:

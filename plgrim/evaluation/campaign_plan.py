@@ -107,7 +107,7 @@ class Run:
     @property
     def name(self) -> str:
         """`world/variant/seed`: also its folder below `runs`."""
-        return f"{self.world}/{self.variant}/seed_{self.seed:03d}"
+        return run_name(self.world, self.variant, self.seed)
 
     @property
     def budget_s(self) -> float:
@@ -169,6 +169,11 @@ class Campaign:
         except ConfigError as error:
             raise ConfigError(f"variant {variant.name} in {world.name}: {error}") from error
         return config
+
+
+def run_name(world: str, variant: str, seed: int) -> str:
+    """What a run is called, and its folder below `runs`."""
+    return f"{world}/{variant}/seed_{seed:03d}"
 
 
 def _refuse_twice(what: str, names: Iterable[str]) -> None:

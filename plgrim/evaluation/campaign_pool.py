@@ -62,14 +62,14 @@ class Pool:
         stop: threading.Event,
         ended: Callable[[Path, int], None],
         poll: Callable[[], None] = lambda: None,
-    ) -> bool:
-        """Until all have ended or `stop`; True when all have. ended: told each folder and exit code as it comes.
+    ) -> None:
+        """Until all have ended or `stop`. ended: told each folder and exit code as it comes.
 
         On `stop`, and whatever is raised, the children are ended: SIGTERM, then SIGKILL; they are not told to `ended`.
         """
         waiting = deque(folders)
         try:
-            while waiting or self.running:
+            while (waiting or self.running) and not stop.is_set():
                 for child in [c for c in self.running if c.process.poll() is not None]:
                     self.running.remove(child)
                     self._is_warm = True
@@ -77,9 +77,8 @@ class Pool:
                 while waiting and len(self.running) < self._allowed():
                     self.running.append(self._start(waiting.popleft()))
                 poll()
-                if stop.wait(_POLL_S):
-                    return False
-            return True
+                if self.running:
+                    stop.wait(_POLL_S)
         finally:
             self._end_all()
 
