@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import spatial
 
 import planning.kernels
 from plgrim.errors import PlgrimError
@@ -31,11 +33,20 @@ from services.sim.raster_cache import Arrays, cached
 from services.sim.world import World
 from services.sim.worlds import build_world
 
-ROUNDS_M2: tuple[tuple[float, ...], ...] = ((0.2, 0.1), (1.0, 0.2, 0.1), (4.0, 0.5, 0.1), (10.0, 1.0, 0.2))
+ROUNDS_M2: tuple[tuple[float, ...], ...] = (
+    (0.2, 0.1),
+    (1.0, 0.2, 0.1),
+    (4.0, 0.5, 0.1),
+    (10.0, 1.0, 0.2),
+    (25.0, 5.0, 1.0),
+)
 """The tours that are tried: the least area, m2, that a viewpoint is visited for in each of their rounds."""
 _TRIES = 4
 """Ground that loses the robot is left out of the next try."""
 _LEFT_OUT_M = 0.8
+_SPARE = 1.1
+"""So much longer than the drive is what is planned: the times of a plan are estimates."""
+_REACHED_M = 0.5
 _ROUNDED_S = 10.0
 """Tours are planned for whole multiples of this, so that missions that end at nearly the same time share one."""
 
@@ -135,7 +146,7 @@ def _attempt(
     time_s: float,
     tell: Tell,
 ) -> tuple[Rehearsed, Driven, Sequence[float]]:
-    plan = planner.rehearse(rounds, time_s)
+    plan = planner.rehearse(rounds, _SPARE * time_s)
     driven = drive_tour(world, config, judge, planner.ground, plan.stretches, time_s)
     tell(
         f"viewpoints from {rounds[0]:g} m2 on: {driven.covered_m2[-1]:.0f} m2 in {driven.time_s[-1]:.0f} s, "
@@ -156,7 +167,7 @@ def _tour(plan: Rehearsed, driven: Driven, rounds: Sequence[float], judge: Judge
         x_m=driven.x_m,
         y_m=driven.y_m,
         yaw_rad=driven.yaw_rad,
-        stops_m=plan.stops_m,
+        stops_m=plan.stops_m[passed(plan.stops_m, driven)],
         reachable_m2=judge.reachable_area_m2,
         viewpoints=plan.viewpoints,
         nearest_neighbour_m=plan.nearest_neighbour_m,
@@ -167,6 +178,12 @@ def _tour(plan: Rehearsed, driven: Driven, rounds: Sequence[float], judge: Judge
         skipped=driven.skipped,
         finished=driven.finished,
     )
+
+
+def passed(stops_m: Points, driven: Driven) -> NDArray[np.bool_]:
+    """Which of the planned stops (n, 2) the drive came to before its time was over."""
+    track = spatial.cKDTree(np.stack([driven.x_m, driven.y_m], axis=1))
+    return np.asarray(track.query(stops_m)[0] <= _REACHED_M) if len(stops_m) else np.zeros(0, np.bool_)
 
 
 def peer_tour(config: SimConfig, time_s: float, tell: Tell) -> Tour:

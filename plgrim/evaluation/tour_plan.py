@@ -36,7 +36,7 @@ _MOST_TURNS = 3
 SHARP_RAD = math.radians(50.0)
 """The follower turns on the spot where the way turns by more; each costs about `_SPOT_S` besides the turning."""
 _SPOT_S = 1.2
-SLOW_MPS, SLOW_MARGIN_M, FREE_MARGIN_M = 0.45, 0.1, 0.3
+SLOW_MPS, SLOW_MARGIN_M, FREE_MARGIN_M = 0.4, 0.1, 0.3
 """Up to the first margin from the rim so slow that a touch breaks nothing, from the second on at full speed."""
 
 
