@@ -109,7 +109,10 @@ def stamp_clearance(
                 out_m[row, column] = 0.0
             elif nearest > _FARTHER * max_clearance_m * max_clearance_m:
                 continue
-            elif second[row, column] > _FARTHER * nearest and _FARTHER * nearest < max_clearance_m * max_clearance_m:
+            elif (
+                second[row, column] > _FARTHER * nearest
+                and _FARTHER * nearest < max_clearance_m * max_clearance_m
+            ):
                 out_m[row, column] = math.sqrt(nearest)
             else:
                 out_m[row, column] = _clearance_at(
@@ -144,7 +147,10 @@ def _take_nearer(
     second: NDArray[np.float64],
 ) -> None:
     """In a row, from column `low` on: the two least different squared distances, those of one more point among them."""
-    r, left = np.uint64(row), np.uint64(low)  # unsigned: no index counts from the end, several columns at a time
+    r, left = (
+        np.uint64(row),
+        np.uint64(low),
+    )  # unsigned: no index counts from the end, several columns at a time
     for c in range(np.uint64(count)):
         squared, least = beside[c] + across, first[r, left + c]
         greater = squared if squared > least else least
