@@ -13,7 +13,6 @@ from scipy.stats import norm
 from planning.grid import FREE, LETHAL, UNKNOWN
 from planning.kernels import njit, njit_borrowing
 
-
 _FARTHER = 1.0 + 1e-6
 """Squared distances are told apart by rounding to float32 when one is so many times the other."""
 
@@ -171,12 +170,13 @@ def _clearance_at(
     nearest_m: float,
 ) -> float:
     """The clearance of one cell, point by point in their order, where rounding decides between two that are as near."""
+    nearest = np.float32(nearest_m)
     for row in range(max(0, r - reach), min(counts.shape[0], r + reach + 1)):
         for column in range(max(0, c - reach), min(counts.shape[1], c + reach + 1)):
             if counts[row, column]:
                 dx = (c - column) * resolution_m - offset_x[row, column]
                 dy = (r - row) * resolution_m - offset_y[row, column]
                 squared = dx * dx + dy * dy
-                if squared < nearest_m * nearest_m:
-                    nearest_m = np.float32(math.sqrt(squared))
-    return nearest_m
+                if squared < nearest * nearest:
+                    nearest = np.float32(math.sqrt(squared))
+    return float(nearest)
