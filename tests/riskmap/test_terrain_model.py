@@ -180,6 +180,25 @@ def test_crowns_and_decks_are_ceiling_and_not_ground() -> None:
     assert not (state == LETHAL).any()
 
 
+def test_ground_that_rises_is_no_ceiling_of_itself() -> None:
+    """Seen from afar, with nothing known of what leads there, a slope's far part hangs in the air."""
+    y = np.arange(-0.5, 0.5, 0.01)
+
+    def slope(*xs: float) -> NDArray[np.float64]:
+        return np.concatenate(
+            [np.stack([0.0 * y + x, y, 0.0 * y + max(0.0, 0.4 * (x - 4.0))], axis=1) for x in xs]
+        )
+
+    model = TerrainModel(config(profile="spot"))
+    model.integrate(sparse_cloud(slope(3.0, 3.9, 8.05), 1))
+    assert at(model, cells_of(model)[CEILING_SEEN], 8.05, 0.05) > 0, "taken for something overhead at first"
+    for k in range(3):
+        model.integrate(sparse_cloud(slope(*np.arange(2.0, 9.0, 0.05)), k + 2))
+    state = layers_of(model, Pose()).state
+    near = [int(at(model, state, x, 0.05)) for x in (7.85, 7.95, 8.05, 8.15)]
+    assert near == [FREE] * 4
+
+
 def test_a_beam_below_the_robots_height_is_an_obstacle() -> None:
     points = [(4.0 + 0.02 * k, 0.005 * j, 0.0) for k in range(5) for j in range(5)]
     beam = [(4.05, 0.005 * j, 0.7) for j in range(5)]
