@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import typer
 
-from plgrim.commands import evaluate_missions
+from plgrim.commands import evaluate_missions, evaluate_tour
 
 
 def register(app: typer.Typer) -> None:
     """Add the group of commands."""
     group = typer.Typer(
-        name="evaluate", help="Experiments: campaigns of missions, and what they show.", no_args_is_help=True
+        name="evaluate", help="Experiments: campaigns of missions, and peers.", no_args_is_help=True
     )
     evaluate_missions.register(group)
+    evaluate_tour.register(group)
     app.add_typer(group)
