@@ -45,9 +45,14 @@ def commands() -> dict[str, set[str]]:
     """The options of each command of the program."""
     group: Any = typer.main.get_command(application)  # of typer's own copy of click
     return {
-        name: {"--help", *(option for parameter in command.params for option in parameter.opts)}
+        name: {"--help", *(o for one in _with_its_own(command) for p in one.params for o in p.opts)}
         for name, command in group.commands.items()
     }
+
+
+def _with_its_own(command: Any) -> list[Any]:
+    """A command, and those under it if it is a group of them."""
+    return [command, *getattr(command, "commands", {}).values()]
 
 
 def calls(text: str) -> list[tuple[str, str]]:
