@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 from services.riskmap.steps import find_steps
 
 _WEIGHT_VARIANCE = 0.02**2
@@ -226,7 +226,7 @@ def _sum_row(
         row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7] = n, s, sx, sxx, sz, sxz, szz, sv
 
 
-@njit
+@njit_borrowing
 def _known_at(known: NDArray[np.bool_], r: int, c: int) -> bool:
     return 0 <= r < known.shape[0] and 0 <= c < known.shape[1] and known[r, c]
 
@@ -253,7 +253,7 @@ def _find_drops(
     rows, columns = known.shape
     for r in range(rows):
         for c in range(columns):
-            if not known[r, c]:
+            if not known[r, c] or _inside(known, r, c):
                 continue
             for dr in range(-1, 2):
                 for dc in range(-1, 2):
@@ -284,7 +284,18 @@ def _find_drops(
                             break
 
 
-@njit
+@njit_borrowing
+def _inside(known: NDArray[np.bool_], r: int, c: int) -> bool:
+    """Whether all eight neighbours are in the grid and known."""
+    if r == 0 or c == 0 or r == known.shape[0] - 1 or c == known.shape[1] - 1:
+        return False
+    return (
+        known[r - 1, c - 1] & known[r - 1, c] & known[r - 1, c + 1] & known[r, c - 1]
+        & known[r, c + 1] & known[r + 1, c - 1] & known[r + 1, c] & known[r + 1, c + 1]
+    )  # fmt: skip
+
+
+@njit_borrowing
 def _rise_per_m(
     height_m: NDArray[np.float32], known: NDArray[np.bool_], r: int, c: int, dr: int, dc: int, length: float
 ) -> float:
@@ -332,27 +343,36 @@ def close_holes(
                 variance[r, c] = doubt / n + sigma_m * sigma_m
 
 
+@njit_borrowing
+def _spread(
+    away: NDArray[np.float32], height_m: NDArray[np.float32], r: int, c: int, rn: int, cn: int, cost: float
+) -> None:
+    if away[rn, cn] + cost < away[r, c]:
+        away[r, c] = away[rn, cn] + cost
+        height_m[r, c] = height_m[rn, cn]
+
+
 @njit
 def spread_heights(height_m: NDArray[np.float32], known: NDArray[np.bool_], otherwise_m: float) -> None:
     """Give unknown cells the height of a near known one, in place: two passes over the grid, as a chamfer distance."""
     rows, columns = known.shape
     away = np.where(known, np.float32(0.0), np.float32(np.inf))
     for turn in range(2):
+        back = -1 if turn == 0 else 1
         for i in range(rows):
             r = i if turn == 0 else rows - 1 - i
-            back = -1 if turn == 0 else 1
             for j in range(columns):
                 c = j if turn == 0 else columns - 1 - j
-                for dr, dc, cost in (
-                    (0, back, 1.0),
-                    (back, 0, 1.0),
-                    (back, back, 1.414),
-                    (back, -back, 1.414),
-                ):
-                    rn, cn = r + dr, c + dc
-                    if 0 <= rn < rows and 0 <= cn < columns and away[rn, cn] + cost < away[r, c]:
-                        away[r, c] = away[rn, cn] + cost
-                        height_m[r, c] = height_m[rn, cn]
+                if away[r, c] == 0.0:
+                    continue
+                if j > 0:
+                    _spread(away, height_m, r, c, r, c + back, 1.0)
+                if i > 0:
+                    _spread(away, height_m, r, c, r + back, c, 1.0)
+                    if j > 0:
+                        _spread(away, height_m, r, c, r + back, c + back, 1.414)
+                    if j < columns - 1:
+                        _spread(away, height_m, r, c, r + back, c - back, 1.414)
     for r in range(rows):
         for c in range(columns):
             if away[r, c] == np.inf:
