@@ -16,7 +16,7 @@ from planning.kernels import njit
 from services.gcp.field import Field
 from services.gcp.net import Net, find_edge
 from services.gcp.qmdp import EdgeTerms, edge_terms, relocation_q
-from services.gcp.ranking import best_frontiers
+from services.gcp.ranking import Ranking
 from services.gcp.roadnet import RoadNet
 
 Floats = NDArray[np.float64]
@@ -103,6 +103,7 @@ class GlobalPlanner:
 
     def _begin_anew(self) -> None:
         self._all, self._far = Field(self.roads, self._floor), Field(self.roads, self._floor)
+        self._ranking = Ranking(self.roads)
         self._paid: dict[int, float] = {}
         self._far_paid: dict[int, float] = {}
         self._single: OrderedDict[int, tuple[float, Field]] = OrderedDict()
@@ -113,16 +114,17 @@ class GlobalPlanner:
         roads = self.roads
         if roads.renewed:
             self._begin_anew()
-        touched = np.array([] if roads.renewed else sorted(roads.touched), np.int32)
-        roads.renewed = False
-        roads.touched.clear()
-        gains = {slot: float(roads.net.gain[slot]) for slot in roads.frontiers.values()}
-        for slot in [slot for slot, (gain, _) in self._single.items() if gains.get(slot) != gain]:
-            del self._single[slot]
+        touched = np.array(sorted(roads.touched), np.int32)
+        gains = dict(zip(touched.tolist(), roads.pays(touched).tolist(), strict=True))
+        for slot in self._single.keys() & gains.keys():
+            if self._single[slot][0] != gains[slot]:
+                del self._single[slot]
         singles = [field for _, field in self._single.values()]
         for field in (self._all, self._far, *singles, *([self._home[1]] if self._home else [])):
             field.touch(touched)
         _pay(self._all, self._paid, gains)
+        roads.renewed = False
+        roads.touched.clear()
 
     def policy(self, nodes: Slots, robot_xyz_m: Floats, local_range_m: float) -> Policy:
         """The policy over all frontiers at nodes (slots), and V when those near the robot are gone.
@@ -133,7 +135,9 @@ class GlobalPlanner:
         frontiers = roads.frontier_slots()
         away = np.linalg.norm(roads.xyz_m[frontiers] - robot_xyz_m, axis=1) > local_range_m
         far = frontiers[away]
-        _pay(self._far, self._far_paid, dict(zip(far.tolist(), roads.net.gain[far].tolist(), strict=True)))
+        gains = dict.fromkeys(self._far_paid, -np.inf)
+        gains |= dict(zip(far.tolist(), roads.net.gain[far].tolist(), strict=True))
+        _pay(self._far, self._far_paid, gains)
         value, to_go = self._all.values(nodes), self._far.values(nodes)
         following = self._all.next_nodes(nodes)
         action = np.where(following >= 0, roads.net.node_id[following], -1)
@@ -143,7 +147,7 @@ class GlobalPlanner:
         """The best frontiers, best first, and those in `keep` (slots); only what can be reached."""
         if not self.roads.frontiers:
             return []
-        shortlist = best_frontiers(self.roads, belief.node, top).tolist()
+        shortlist = self._ranking.best(belief.node, top).tolist()
         candidates = self.candidates(belief)
         terms = self._terms(candidates.distance_m, candidates.risk)
         wanted = [*dict.fromkeys([*shortlist, *keep])]
@@ -231,13 +235,15 @@ class GlobalPlanner:
 
 
 def _pay(field: Field, paid: dict[int, float], gains: dict[int, float]) -> None:
-    """Tell a field what its goals pay now, `gains` by slot; `paid`: what they paid so far, brought up to date."""
-    news = {slot: gain for slot, gain in gains.items() if paid.get(slot) != gain}
-    news.update(dict.fromkeys(paid.keys() - gains.keys(), -np.inf))
+    """Tell a field what some slots pay now (-inf: nothing). paid: what its goals paid so far, brought up to date."""
+    news = {slot: gain for slot, gain in gains.items() if paid.get(slot, -np.inf) != gain}
     if news:
-        field.pay(np.array(sorted(news), np.int32), np.array([news[slot] for slot in sorted(news)]))
-        paid.clear()
-        paid.update(gains)
+        field.pay(np.array([*news], np.int32), np.array([*news.values()]))
+    for slot, gain in news.items():
+        if gain > -np.inf:
+            paid[slot] = gain
+        else:
+            del paid[slot]
 
 
 def _or_nothing(value: Floats) -> Floats:

@@ -55,6 +55,7 @@ class RoadNet:
         self._next, self._used = 0, 0
         self._cells: dict[tuple[int, int], set[int]] = {}
         self.frontiers: dict[int, int] = {}
+        self._in_order: Slots | None = None
         self.touched: set[int] = set()
         self.renewed = True
 
@@ -103,7 +104,7 @@ class RoadNet:
                 first = int(self.net.begin[slot])
                 self.touched |= {slot, *self.net.other[first : first + int(self.net.degree[slot])].tolist()}
                 self._leave_cell(slot)
-                self.frontiers.pop(node, None)
+                self._set_frontier(node, None)
                 drop_node(self.net, slot)
                 self._slot_of[node] = -1
                 self._free.append(slot)
@@ -134,11 +135,18 @@ class RoadNet:
             self.xyz_m[slot], self.raw_gain[slot] = xyz, raw
             self.net.terminal[slot], self.net.gain[slot] = kind == FRONTIER, gain
             self._cells.setdefault(_cell(xyz), set()).add(slot)
-            if kind == FRONTIER:
-                self.frontiers[node] = slot
-            else:
-                self.frontiers.pop(node, None)
+            self._set_frontier(node, slot if kind == FRONTIER else None)
             self.touched.add(slot)
+
+    def _set_frontier(self, node: int, slot: int | None) -> None:
+        """Note that a node is a frontier, or not (any more)."""
+        if self.frontiers.get(node) == slot:
+            return
+        self._in_order = None
+        if slot is None:
+            del self.frontiers[node]
+        else:
+            self.frontiers[node] = slot
 
     def _new_slot(self, node: int) -> int:
         slot = self._free.pop() if self._free else self._next
@@ -214,7 +222,13 @@ class RoadNet:
 
     def frontier_slots(self) -> Slots:
         """Slots of the frontiers, by their ids."""
-        return np.array([self.frontiers[node] for node in sorted(self.frontiers)], np.int32)
+        if self._in_order is None:
+            self._in_order = np.array([self.frontiers[node] for node in sorted(self.frontiers)], np.int32)
+        return self._in_order
+
+    def pays(self, slots: Slots) -> Floats:
+        """What nodes pay on arrival, -inf: they are no frontiers."""
+        return np.where(self.net.terminal[slots], self.net.gain[slots], -np.inf)
 
     def snapshot(self) -> dict[str, Any]:
         """Everything held: numbers and arrays, nodes by id, edges by (a, b)."""

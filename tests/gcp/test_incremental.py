@@ -17,7 +17,7 @@ from schemas.snapshot import pack_snapshot
 from schemas.world import GlobalIrm
 from services.gcp.field import Field
 from services.gcp.planner import Belief, GlobalPlanner
-from services.gcp.ranking import _rank, best_frontiers
+from services.gcp.ranking import Ranking
 from services.gcp.roadnet import RoadNet
 from tests.gcp import full_planner
 from tests.gcp.frontier_values import _first_pass
@@ -328,7 +328,9 @@ def test_the_best_frontiers_are_those_of_the_whole_search(seed: int, top: int) -
     }
     world = chain(150, gains)
     start = int(rng.integers(1, 151))
-    found = best_frontiers(world.roads, world.roads.slot_of(start), top)
+    ranking = Ranking(world.roads)
+    ranking.best(world.roads.slot_of(75), top)
+    found = ranking.best(world.roads.slot_of(start), top)
     road_map, planner = full(world)
     priced = np.empty((planner.frontiers.size, 3))
     reference = float(planner.graph.gain[planner.frontiers].max())
@@ -343,10 +345,9 @@ def test_the_best_frontiers_are_those_of_the_whole_search(seed: int, top: int) -
 def test_the_search_for_the_best_frontiers_ends_before_the_world_does() -> None:
     """Behind the third frontier nothing can be among the best three, and the search does not go there."""
     world = chain(3000, {10: 9.0, 20: 12.0, 40: 8.0, 1000: 20.0, 2000: 20.0})
-    found = np.empty(5, np.int32), np.empty(5)
-    slots = world.roads.frontier_slots()
-    count = _rank(world.roads.net, world.roads.slot_of(1), slots, slots[::-1].copy(), 3, *found)
-    assert count == 3
+    ranking = Ranking(world.roads)
+    assert world.roads.net.node_id[ranking.best(world.roads.slot_of(1), 3)].tolist() == [3001, 3002, 3003]
+    assert ranking.steps < 200
 
 
 @pytest.mark.parametrize("behind", [200, 4000])
