@@ -41,10 +41,10 @@ class Config(BaseModel):
         description="Frontiers so near are the local planner's: not in the value to go, m.",
     )
     policy_radius_m: float = Field(
-        60.0,
+        32.0,
         ge=1,
         le=1e6,
-        description="Nodes so near are told with action and value, and those of the path; a message stays small, m.",
+        description="Nodes so near are told with action and value, and the path there: at least the Local IRM, m.",
     )
     alternatives: int = Field(5, ge=1, le=50, description="Frontiers weighed exactly and reported.")
     ask_again_s: float = Field(2.0, gt=0, le=60, description="Time between requests for the whole graph, s.")
