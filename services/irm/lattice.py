@@ -213,9 +213,17 @@ def _connect(
         start_r = math.floor(anchor_m[node, 1] / resolution_m) - iy0
         reach = math.ceil(2.2 * spacing_m / resolution_m)
         box = (start_r - reach, start_r + reach + 1, start_c - reach, start_c + reach + 1)
+        ends = np.empty((4, 2), np.int32)
+        awaited = 0
+        for k in range(4):
+            if pending[k] == 1:
+                other = (row + _DY[k]) * size + column + _DX[k]
+                ends[awaited, 0] = math.floor(anchor_m[other, 1] / resolution_m) - iy0
+                ends[awaited, 1] = math.floor(anchor_m[other, 0] / resolution_m) - ix0
+                awaited += 1
         dijkstra_box(
-            step_cost, free_space, resolution_m, start_r, start_c, box, np.empty((0, 2), np.int32),
-            6.0 * spacing_m, cost, parent,
+            step_cost, free_space, resolution_m, start_r, start_c, box, ends[:awaited], 6.0 * spacing_m, cost,
+            parent,
         )  # fmt: skip
         for k in range(4):
             if pending[k] == 0:
