@@ -122,7 +122,7 @@ class GraphMirror:
         whole = update.base_version == 0
         if not whole and update.base_version != self.version:
             return False
-        if not _well_formed(update):
+        if not well_formed(update):
             return False
         node_id, nodes = _empty_nodes() if whole else (self._node_id, self._nodes)
         edge, edges = _empty_edges() if whole else (self._edge, self._edges)
@@ -241,7 +241,7 @@ def _rows_of(keys: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.i
     return np.unique(rows[keys[rows] == wanted[inside]])
 
 
-def _well_formed(update: GraphUpdate) -> bool:
+def well_formed(update: GraphUpdate) -> bool:
     """No node twice; every edge once, from a lower to a higher id; ids that two fit into 64 bits."""
     edge = np.column_stack((update.edge_a, update.edge_b)).astype(np.int64).reshape(-1, 2)
     ids = np.concatenate((update.node_id, edge.ravel()))

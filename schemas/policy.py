@@ -25,13 +25,16 @@ class Alternative(Header):
 class GlobalPolicy(Message):
     """The QMDP policy over the Global IRM, in `map`.
 
-    node_id, action, value: of the nodes around the robot and on the path (a whole graph may be large), the next node of
-    the policy (-1: stay) and V. value_to_go: V without the frontiers that the local planner can reach by itself: what
-    the rest of the mission is worth from here.
-    target: frontier id (-1: none). path_xyz_m: from the robot's node to the target.
+    node_id, action, value: of the nodes around the robot that are worth something, the next node of the policy (-1:
+    stay) and V, staying for nothing being an action. value_to_go: V without the frontiers that the local planner can
+    reach by itself: what the rest of the mission is worth from here. A node that is not told has neither.
+    target: frontier id (-1: none). path_node, path_xyz_m: the way from the robot's node to the target as far as it runs
+    around the robot, with the first node outside; of one piece (path_piece, ascending) each node is joined to the next,
+    between two pieces the way runs outside. route_xyz_m: a few places of the whole way, to be shown.
     """
 
     schema_name: ClassVar[str] = "global_policy"
+    schema_version: ClassVar[int] = 2
 
     irm_version: int = Field(ge=1)
     target: int = Field(ge=-1)
@@ -53,6 +56,8 @@ class GlobalPolicy(Message):
     value_to_go: Annotated[Array, column("float64", "n")]
     path_node: Annotated[Array, column("int64", "p", minimum=0)]
     path_xyz_m: Annotated[Array, column("float64", "p", 3)]
+    path_piece: Annotated[Array, column("int32", "p", minimum=0)]
+    route_xyz_m: Annotated[Array, column("float64", "r", 3)]
 
 
 class EpisodeRequest(Message):

@@ -147,12 +147,16 @@ def _beside_tour(config: Config, result: dict[str, Any], out: Path) -> dict[str,
     import json
 
     from plgrim.config import check_service
-    from plgrim.evaluation.tour import compare, peer_tour
+    from plgrim.evaluation.tour import TourError, compare, peer_tour
     from services.sim.config import SimConfig
 
     options = check_service(config, "sim")
     assert isinstance(options, SimConfig)
-    tour = peer_tour(options, float(result["elapsed_s"] or 0.0), lambda text: print(text, flush=True))
+    try:
+        tour = peer_tour(options, float(result["elapsed_s"] or 0.0), lambda text: print(text, flush=True))
+    except TourError as error:  # the mission's own result is not lost with it
+        print(f"plgrim: no peer: {error}", file=sys.stderr)
+        return result
     compared = compare(result, tour)
     (out / "result.json").write_text(json.dumps(compared, indent=2) + "\n", encoding="utf-8")
     return compared

@@ -97,7 +97,11 @@ class Tour:
             "coverage": covered_m2 / self.reachable_m2,
             "driven_s": float(self.time_s[-1]),
             "stops": len(self.stops_m),
-            **{name: value for name, value in figures.items() if isinstance(value, int | float)},
+            **{
+                name: value
+                for name, value in figures.items()
+                if isinstance(value, int | float) and name != "reachable_m2"
+            },
         }
 
 

@@ -1,46 +1,40 @@
 """One planning step over the Global IRM: values, frontiers weighed under the pose belief, and the way to one.
 
-Pure: a road map and a pose belief in, values and ways out. The choice of the target, which remembers, is the
-stage's.
+What was computed is kept between steps and follows what the graph's messages change (`field.py`); the choice of the
+target, which remembers, is the stage's.
 """
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.graph_mirror import BREADCRUMB, FRONTIER, RoadMap
-from planning.reward import RewardWeights
-from services.gcp.alternatives import frontier_values
-from services.gcp.qmdp import (
-    STAY,
-    EdgeTerms,
-    GlobalGraph,
-    edge_terms,
-    global_graph,
-    label_setting,
-    label_setting_to,
-    relocation_q,
-    solve,
-)
+from planning.kernels import njit
+from services.gcp.field import Field
+from services.gcp.net import Net, find_edge
+from services.gcp.qmdp import EdgeTerms, edge_terms, relocation_q
+from services.gcp.ranking import Ranking
+from services.gcp.roadnet import RoadNet
 
 Floats = NDArray[np.float64]
-Indices = NDArray[np.int32]
+Slots = NDArray[np.int32]
+
+_KEPT_FIELDS = 12
+"""Frontiers whose fields are kept: those weighed now, and some that were and may be again."""
 
 
 class Belief(NamedTuple):
-    """The robot's pose as particles in `map`: (P, 3) positions, equally likely; node: index it is nearest
-    to.
-    """
+    """The robot's pose as particles in `map`: (P, 3) positions, equally likely; node: slot it is nearest to."""
 
     xyz_m: Floats
     node: int
 
 
 class Option(NamedTuple):
-    """One frontier and the best way to it. node: its index; path: indices from the robot's node to it.
+    """One frontier and the best way to it. node: its slot; path: slots from the robot's node to it.
 
     q: Q(b, a) of the first action of that way, with this frontier as the only goal. distance_m and risk are
     those of the way from the mean pose.
@@ -51,155 +45,169 @@ class Option(NamedTuple):
     gain: float
     distance_m: float
     risk: float
-    path: Indices
+    path: Slots
 
 
-class Values(NamedTuple):
-    """V and the node that the policy goes to next (-1: stay), (n,) each."""
+class Policy(NamedTuple):
+    """Of some nodes: V, the id of the node that the policy goes to next (-1: stay), and the value to go, (n,) each."""
 
     value: Floats
     action: NDArray[np.int64]
+    value_to_go: Floats
 
 
 class Candidates(NamedTuple):
     """Actions "relocate to node j": the robot's node and its neighbours.
 
-    node: (C,) indices. distance_m, risk: (P, C) of the way from every particle.
+    node: (C,) slots. distance_m, risk: (P, C) of the way from every particle.
     """
 
-    node: Indices
+    node: Slots
     distance_m: Floats
     risk: Floats
 
 
-class GlobalPlanner:
-    """The QMDP of one version of the graph."""
+@njit
+def _measure(net: Net, path: Slots) -> tuple[float, float]:
+    """Length of a path over edges, and the probability that one of them fails."""
+    length_m, safe = 0.0, 1.0
+    for k in range(path.shape[0] - 1):
+        edge = find_edge(net, path[k], path[k + 1])
+        length_m += net.distance_m[edge]
+        safe *= 1.0 - net.risk[edge]
+    return length_m, 1.0 - safe
 
-    def __init__(self, road_map: RoadMap, weights: RewardWeights) -> None:
-        self.road_map = road_map
-        self.weights = weights
-        self.frontiers = np.flatnonzero(road_map.kind == FRONTIER).astype(np.int32)
-        terms = self._terms(road_map.distance_m, road_map.risk)
-        gains = weights.k_information * road_map.gain[self.frontiers]
-        self.graph = global_graph(road_map.indptr, road_map.indices, terms, self.frontiers, gains)
+
+@njit
+def _relocations(
+    net: Net, nodes: Slots, to_robot: Floats, risk_robot: Floats, at: int, distance_m: Floats, risk: Floats
+) -> None:
+    """Fill the way from the candidate `at` to all of them, (C,): by an edge, or by way of the robot's node."""
+    for k in range(nodes.shape[0]):
+        distance_m[k] = to_robot[at] + to_robot[k]
+        risk[k] = 1.0 - (1.0 - risk_robot[at]) * (1.0 - risk_robot[k])
+        if k > 0 and k != at:
+            edge = find_edge(net, nodes[at], nodes[k])
+            if edge >= 0 and net.distance_m[edge] < distance_m[k]:
+                distance_m[k], risk[k] = net.distance_m[edge], net.risk[edge]
+    distance_m[at] = risk[at] = 0.0
+
+
+class GlobalPlanner:
+    """The QMDP of a road net that changes."""
+
+    def __init__(self, roads: RoadNet, policy_floor: float = 0.0) -> None:
+        self.roads = roads
+        self._floor = policy_floor
+        self._begin_anew()
+
+    def _begin_anew(self) -> None:
+        self._all, self._far = Field(self.roads, self._floor), Field(self.roads, self._floor)
+        self._ranking = Ranking(self.roads)
+        self._paid: dict[int, float] = {}
+        self._far_paid: dict[int, float] = {}
+        self._single: OrderedDict[int, tuple[float, Field]] = OrderedDict()
+        self._home: tuple[int, Field] | None = None
+
+    def follow(self) -> None:
+        """Take in what changed in the road net since the last call."""
+        roads = self.roads
+        if roads.renewed:
+            self._begin_anew()
+        touched = np.array(sorted(roads.touched), np.int32)
+        gains = dict(zip(touched.tolist(), roads.pays(touched).tolist(), strict=True))
+        for slot in self._single.keys() & gains.keys():
+            if self._single[slot][0] != gains[slot]:
+                del self._single[slot]
+        singles = [field for _, field in self._single.values()]
+        for field in (self._all, self._far, *singles, *([self._home[1]] if self._home else [])):
+            field.touch(touched)
+        _pay(self._all, self._paid, gains)
+        roads.renewed = False
+        roads.touched.clear()
+
+    def policy(self, nodes: Slots, robot_xyz_m: Floats, local_range_m: float) -> Policy:
+        """The policy over all frontiers at nodes (slots), and V when those near the robot are gone.
+
+        Staying, of value 0, is an action here: what is worth less than nothing from a node matters to nobody there.
+        """
+        roads = self.roads
+        frontiers = roads.frontier_slots()
+        away = np.linalg.norm(roads.xyz_m[frontiers] - robot_xyz_m, axis=1) > local_range_m
+        far = frontiers[away]
+        gains = dict.fromkeys(self._far_paid, -np.inf)
+        gains |= dict(zip(far.tolist(), roads.net.gain[far].tolist(), strict=True))
+        _pay(self._far, self._far_paid, gains)
+        value, to_go = self._all.values(nodes), self._far.values(nodes)
+        following = self._all.next_nodes(nodes)
+        action = np.where(following >= 0, roads.net.node_id[following], -1)
+        return Policy(_or_nothing(value), action, _or_nothing(to_go))
+
+    def options(self, belief: Belief, keep: list[int], top: int) -> list[Option]:
+        """The best frontiers, best first, and those in `keep` (slots); only what can be reached."""
+        if not self.roads.frontiers:
+            return []
+        shortlist = self._ranking.best(belief.node, top).tolist()
+        candidates = self.candidates(belief)
+        terms = self._terms(candidates.distance_m, candidates.risk)
+        wanted = [*dict.fromkeys([*shortlist, *keep])]
+        found = [self._option(node, belief, candidates, terms) for node in wanted]
+        while len(self._single) > max(_KEPT_FIELDS, len(wanted)):
+            self._single.popitem(last=False)
+        reached = [option for option in found if option is not None]
+        return sorted(reached, key=lambda option: (-option.q, int(self.roads.net.node_id[option.node])))
 
     def _terms(self, distance_m: Floats, risk: Floats) -> EdgeTerms:
-        """Cost (paper: C = k_d d + k_rho rho + k_mu mu, with mu = 0 as headings are not in the state) and
-        discount.
-        """
-        w = self.weights
+        """Cost and discount of relocations."""
+        w = self.roads.weights
         cost = w.k_cost * (w.k_distance_per_m * distance_m + w.k_risk * risk)
         return edge_terms(distance_m, risk, cost, w.gamma_per_m)
 
-    def values(self) -> Values:
-        """The policy over all frontiers.
+    def _field_of(self, frontier: int) -> Field:
+        """The field of one frontier as the only goal; the ones asked for last are kept."""
+        if frontier not in self._single:
+            gain = self.roads.net.gain[[frontier]]
+            self._single[frontier] = (float(gain[0]), Field(self.roads))
+            self._single[frontier][1].pay(np.array([frontier], np.int32), gain)
+        self._single.move_to_end(frontier)
+        return self._single[frontier][1]
 
-        Staying is no action: what is left must be visited, whatever it costs.
-        """
-        return self._values(self.graph)
-
-    def values_to_go(self, robot_xyz_m: Floats, local_range_m: float) -> Values:
-        """The policy when the frontiers within `local_range_m` of the robot are gone."""
-        graph, road_map = self.graph, self.road_map
-        near = np.linalg.norm(road_map.xyz_m - robot_xyz_m, axis=1) <= local_range_m
-        gone = graph.terminal & near
-        source = np.repeat(np.arange(gone.size), np.diff(road_map.indptr))
-        cost = np.where(gone[source] | gone[road_map.indices], np.inf, graph.cost)
-        return self._values(graph._replace(terminal=graph.terminal & ~gone, cost=cost))
-
-    def _values(self, graph: GlobalGraph) -> Values:
-        solution = solve(graph, allow_stay=False)
-        return Values(solution.value, self._next_node(solution.action))
-
-    def _next_node(self, action: Indices) -> NDArray[np.int64]:
-        """Ids of the nodes that the edges of a policy lead to."""
-        if self.road_map.indices.size == 0:
-            return np.full(action.size, -1, np.int64)
-        target = self.road_map.indices[np.where(action == STAY, 0, action)]
-        return np.where(action == STAY, -1, self.road_map.node_id[target])
-
-    def options(self, belief: Belief, keep: list[int], top: int) -> list[Option]:
-        """The best frontiers, best first, and those in `keep` (indices); only what can be reached."""
-        road_map = self.road_map
-        if self.frontiers.size == 0:
-            return []
-        ranked = frontier_values(self.graph, road_map.distance_m, road_map.risk, belief.node, top)
-        shortlist = [
-            int(n) for n, v in zip(ranked.node[:top], ranked.value[:top], strict=True) if v > -np.inf
-        ]
-        candidates = self.candidates(belief)
-        found = [self._option(node, belief, candidates) for node in dict.fromkeys([*shortlist, *keep])]
-        reached = [option for option in found if option is not None]
-        return sorted(reached, key=lambda option: (-option.q, option.node))
-
-    def _option(self, frontier: int, belief: Belief, candidates: Candidates) -> Option | None:
+    def _option(
+        self, frontier: int, belief: Belief, candidates: Candidates, terms: EdgeTerms
+    ) -> Option | None:
         """Q(b, a) = sum over q of b(q) Q(q, a), for one frontier as the only goal; None when there is no
         way.
         """
-        target = np.array([frontier], np.int32)
-        action = np.empty(self.road_map.node_id.size, np.int32)
-        value = label_setting_to(
-            self.graph, target, -np.inf, self._labelled(candidates.node, frontier), action
-        )
-        at = value[candidates.node]
-        if not np.isfinite(at).any():
-            return None
+        roads, field = self.roads, self._field_of(frontier)
+        nodes = candidates.node
+        passing = ~roads.net.terminal[nodes] | (nodes == frontier)
+        at = np.full(nodes.size, -np.inf)
+        at[passing] = field.values(nodes[passing])
         open_ = np.isfinite(at)
-        cost = self._terms(candidates.distance_m[:, open_], candidates.risk[:, open_])
-        q = relocation_q(at[open_], np.ones(len(belief.xyz_m)), cost)
-        first = int(candidates.node[open_][int(np.argmax(q))])
-        path = self._path(belief.node, first, action)
-        straight = float(np.linalg.norm(belief.xyz_m.mean(axis=0) - self.road_map.xyz_m[belief.node]))
-        distance_m, risk = self._measure(path)
-        gain = float(self.road_map.gain[frontier])
+        if not open_.any():
+            return None
+        part = EdgeTerms(terms.discount[:, open_], terms.cost[:, open_])
+        q = relocation_q(at[open_], np.ones(len(belief.xyz_m)), part)
+        path = field.way(belief.node, int(nodes[open_][int(np.argmax(q))]))
+        distance_m, risk = _measure(roads.net, path)
+        straight = float(np.linalg.norm(belief.xyz_m.mean(axis=0) - roads.xyz_m[belief.node]))
+        gain = float(roads.raw_gain[frontier])
         return Option(frontier, float(q.max()), gain, straight + distance_m, risk, path)
-
-    def _labelled(self, nodes: Indices, frontier: int) -> Indices:
-        """Those of the nodes that get a label on the way to a frontier: not the other frontiers."""
-        return nodes[~self.graph.terminal[nodes] | (nodes == frontier)]
 
     def way_home(self, start: int, home: int) -> Option | None:
         """The cheapest way to a node, without discount, in which frontiers may be crossed; None when there
         is none.
         """
-        goal = np.zeros_like(self.graph.terminal)
-        goal[home] = True
-        w, road_map = self.weights, self.road_map
-        cost = w.k_cost * (w.k_distance_per_m * road_map.distance_m + w.k_risk * road_map.risk)
-        terms = edge_terms(road_map.distance_m, road_map.risk, cost, 1.0)
-        graph = self.graph._replace(
-            discount=terms.discount, cost=terms.cost, terminal=goal, gain=np.zeros(goal.size)
-        )
-        action = np.empty(goal.size, np.int32)
-        value = label_setting(graph, np.array([home], np.int32), -np.inf, -1, action)
-        if not np.isfinite(value[start]):
+        if self._home is None or self._home[0] != home:
+            self._home = (home, Field(self.roads, home=True))
+            self._home[1].pay(np.array([home], np.int32), np.zeros(1))
+        field = self._home[1]
+        value = float(field.values(np.array([start], np.int32))[0])
+        if not np.isfinite(value):
             return None
-        path = self._path(start, start, action)
-        distance_m, risk = self._measure(path)
-        return Option(home, float(value[start]), 0.0, distance_m, risk, path)
-
-    def _path(self, start: int, first: int, action: Indices) -> Indices:
-        """Nodes from `start` by way of `first` along a policy without cycles; no node twice."""
-        path = [start] if first == start else [start, first]
-        while action[path[-1]] != STAY:
-            path.append(int(self.road_map.indices[action[path[-1]]]))
-        last = len(path) - 1 - path[::-1].index(start)
-        return np.array(path[last:], np.int32)
-
-    def _measure(self, path: Indices) -> tuple[float, float]:
-        """Length of a path over edges, and the probability that one of them fails."""
-        length_m, safe = 0.0, 1.0
-        for a, b in zip(path[:-1].tolist(), path[1:].tolist(), strict=True):
-            edge = self._edge(a, b)
-            length_m += float(self.road_map.distance_m[edge])
-            safe *= 1.0 - float(self.road_map.risk[edge])
-        return length_m, 1.0 - safe
-
-    def _edge(self, a: int, b: int) -> int:
-        """Index of the edge from a to b, -1 when there is none."""
-        low, high = int(self.road_map.indptr[a]), int(self.road_map.indptr[a + 1])
-        slot = low + int(np.searchsorted(self.road_map.indices[low:high], b))
-        return slot if slot < high and int(self.road_map.indices[slot]) == b else -1
+        path = field.way(start, start)
+        distance_m, risk = _measure(self.roads.net, path)
+        return Option(home, value, 0.0, distance_m, risk, path)
 
     def candidates(self, belief: Belief) -> Candidates:
         """The relocations from the robot's neighbourhood, with the way there from every particle.
@@ -207,28 +215,37 @@ class GlobalPlanner:
         A particle stands at the breadcrumb nearest to it among the robot's and its neighbours, and goes from
         there by an edge, or by way of the robot's node.
         """
-        road_map, robot = self.road_map, belief.node
-        edges = slice(int(road_map.indptr[robot]), int(road_map.indptr[robot + 1]))
-        nodes = np.concatenate((np.array([robot], np.int32), road_map.indices[edges]))
-        to_robot = np.concatenate((np.zeros(1), road_map.distance_m[edges]))
-        risk_robot = np.concatenate((np.zeros(1), road_map.risk[edges]))
-        stands = np.flatnonzero(road_map.kind[nodes] == BREADCRUMB)
+        roads, robot = self.roads, belief.node
+        net, first = roads.net, int(roads.net.begin[robot])
+        edges = slice(first, first + int(net.degree[robot]))
+        nodes = np.concatenate((np.array([robot], np.int32), net.other[edges]))
+        to_robot = np.concatenate((np.zeros(1), net.distance_m[edges]))
+        risk_robot = np.concatenate((np.zeros(1), net.risk[edges]))
+        stands = np.flatnonzero(~net.terminal[nodes])
         stands = stands if stands.size else np.zeros(1, np.int64)
-        offset = belief.xyz_m[:, None, :] - road_map.xyz_m[nodes[stands]][None, :, :]
+        offset = belief.xyz_m[:, None, :] - roads.xyz_m[nodes[stands]][None, :, :]
         gap_m = np.linalg.norm(offset, axis=2)
         nearest = np.argmin(gap_m, axis=1)
-        rows = np.unique(nearest)
-        distance_m = np.empty((stands.size, nodes.size))
-        risk = np.empty((stands.size, nodes.size))
-        for row in rows.tolist():
+        distance_m, risk = np.empty((stands.size, nodes.size)), np.empty((stands.size, nodes.size))
+        for row in np.unique(nearest).tolist():
             at = int(stands[row])
-            distance_m[row] = to_robot[at] + to_robot
-            risk[row] = 1.0 - (1.0 - risk_robot[at]) * (1.0 - risk_robot)
-            distance_m[row, at] = risk[row, at] = 0.0
-            for column in range(1, nodes.size):
-                edge = self._edge(int(nodes[at]), int(nodes[column]))
-                if column != at and edge >= 0 and road_map.distance_m[edge] < distance_m[row, column]:
-                    distance_m[row, column] = road_map.distance_m[edge]
-                    risk[row, column] = road_map.risk[edge]
+            _relocations(net, nodes, to_robot, risk_robot, at, distance_m[row], risk[row])
         particles = np.arange(nearest.size)
         return Candidates(nodes, gap_m[particles, nearest][:, None] + distance_m[nearest], risk[nearest])
+
+
+def _pay(field: Field, paid: dict[int, float], gains: dict[int, float]) -> None:
+    """Tell a field what some slots pay now (-inf: nothing). paid: what its goals paid so far, brought up to date."""
+    news = {slot: gain for slot, gain in gains.items() if paid.get(slot, -np.inf) != gain}
+    if news:
+        field.pay(np.array([*news], np.int32), np.array([*news.values()]))
+    for slot, gain in news.items():
+        if gain > -np.inf:
+            paid[slot] = gain
+        else:
+            del paid[slot]
+
+
+def _or_nothing(value: Floats) -> Floats:
+    """The values, 0 where there is none."""
+    return np.where(value == -np.inf, 0.0, value)

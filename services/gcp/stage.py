@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.frames import Planar
-from planning.graph_mirror import GraphMirror, RoadMap
 from planning.randomness import stream
 from planning.reward import RewardWeights
 from schemas.base import Pose
@@ -20,11 +19,13 @@ from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION, ODOMETRY
 from schemas.world import GraphRequest
 from services.gcp.config import Config
-from services.gcp.planner import Belief, Floats, GlobalPlanner, Option, Values
+from services.gcp.planner import Belief, Floats, GlobalPlanner, Option, Slots
+from services.gcp.roadnet import Graph, RoadNet
 
 __all__ = ["Config", "GcpStage", "create", "spec", "warm_up"]
 
 _OVER = (MissionPhase.DONE, MissionPhase.STOPPED)
+_ROUTE_PLACES = 16
 
 
 def spec(config: Config) -> StageSpec:
@@ -57,12 +58,13 @@ class _Choice(NamedTuple):
 
 
 class GcpStage:
-    """Keeps a mirror of the graph and the target; plans anew at every step."""
+    """Keeps the graph, what was computed on it, and the target; decides anew at every step."""
 
     def __init__(self, config: Config, setup: StageSetup) -> None:
         self.config = config
         self._seed = setup.seed
-        self._mirror = GraphMirror()
+        self._roads = RoadNet(config.reward)
+        self._planner = GlobalPlanner(self._roads)
         self._target = _Target()
         self._tick = 0
         self._asked_ns = -1
@@ -72,10 +74,10 @@ class GcpStage:
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One step: the global policy, and a request for the graph when a difference was missed."""
         asks = self._update_graph(now, inputs)
-        request = GraphRequest(stamp_ns=now, have_version=self._mirror.version)
+        request = GraphRequest(stamp_ns=now, have_version=self._roads.version)
         requests = outputs([(GCP_GRAPH_REQUEST, request)] if asks else [])
         odometry, mission = inputs.current(ODOMETRY), inputs.current(MISSION)
-        if odometry is None or self._mirror.version == 0:
+        if odometry is None or self._roads.version == 0:
             return requests
         self._tick += 1
         return [*outputs([(GLOBAL_POLICY, self._plan(now, odometry, mission))]), *requests]
@@ -84,7 +86,7 @@ class GcpStage:
         """Apply what came; whether the whole graph must be asked for now."""
         fits = True
         for received in inputs.new(GLOBAL_IRM):
-            fits = self._mirror.apply(received.message)
+            fits = self._roads.apply(received.message)
             if fits:
                 self._frame = received.message.map_to_odom
         if fits or (self._asked_ns >= 0 and now - self._asked_ns < self.config.ask_again_s * SECOND_NS):
@@ -93,13 +95,11 @@ class GcpStage:
         return True
 
     def _plan(self, now: Stamp, odometry: Odometry, mission: MissionState | None) -> GlobalPolicy:
-        planner = GlobalPlanner(self._mirror.road_map(), self.config.reward)
+        self._planner.follow()
         belief = self._belief(odometry)
-        choice = self._choose(planner, belief, mission)
-        robot = np.array(_robot_xyz(self._frame, odometry.pose))
-        self._remember(planner, choice)
-        to_go = planner.values_to_go(robot, self.config.local_range_m)
-        return self._message(now, odometry, planner, choice, (planner.values(), to_go), robot)
+        choice = self._choose(belief, mission)
+        self._remember(choice)
+        return self._message(now, choice, np.array(_robot_xyz(self._frame, odometry.pose)))
 
     def _belief(self, odometry: Odometry) -> Belief:
         """Particles of the pose, from the covariance of the odometry in `map`; the same for the same seed
@@ -114,55 +114,51 @@ class GcpStage:
         spread = rng.standard_normal((self.config.particles, 2)) * np.sqrt(np.maximum(variance, 0.0))
         xyz = np.tile(mean, (self.config.particles, 1))
         xyz[:, :2] += spread @ axes.T
-        road_map = self._mirror.road_map()
-        node = road_map.index_of(self._mirror.robot_node)
-        if node < 0:
-            node = road_map.nearest_breadcrumb((float(mean[0]), float(mean[1]), float(mean[2])))
-        return Belief(xyz, node)
+        node = self._roads.slot_of(self._roads.robot_node)
+        return Belief(xyz, node if node >= 0 else self._roads.nearest_breadcrumb(mean))
 
-    def _choose(self, planner: GlobalPlanner, belief: Belief, mission: MissionState | None) -> _Choice:
+    def _choose(self, belief: Belief, mission: MissionState | None) -> _Choice:
         """The target: home on the way back, else the frontier held or a clearly better one."""
         if belief.node < 0:
             return _Choice(None, "no target: the graph has no breadcrumb yet")
         if mission is not None and mission.phase in _OVER:
             return _Choice(None, f"no target: the mission is over ({mission.finish.value})")
         if mission is not None and mission.phase == MissionPhase.RETURN:
-            return self._choose_home(planner, belief, mission)
-        held = self._held_frontiers(planner)
-        options = planner.options(belief, held, self.config.alternatives)
+            return self._choose_home(belief, mission)
+        held = self._held_frontiers()
+        options = self._planner.options(belief, held, self.config.alternatives)
         if not options:
-            count = planner.frontiers.size
+            count = len(self._roads.frontiers)
             reason = (
                 f"none of {count} frontiers can be reached over the graph" if count else "no frontier is left"
             )
             return _Choice(None, f"no target: {reason}")
-        return self._keep_or_switch(planner, options, held)
+        return self._keep_or_switch(options, held)
 
-    def _choose_home(self, planner: GlobalPlanner, belief: Belief, mission: MissionState) -> _Choice:
+    def _choose_home(self, belief: Belief, mission: MissionState) -> _Choice:
         home = (mission.home.x_m, mission.home.y_m, mission.home.z_m)
-        option = planner.way_home(belief.node, planner.road_map.nearest_breadcrumb(home))
+        option = self._planner.way_home(belief.node, self._roads.nearest_breadcrumb(np.array(home)))
         if option is None:
             return _Choice(None, "no target: the graph has no way home")
         return _Choice(option, f"home: {option.distance_m:.0f} m, risk {option.risk:.2f}", extra_xyz_m=home)
 
-    def _held_frontiers(self, planner: GlobalPlanner) -> list[int]:
+    def _held_frontiers(self) -> list[int]:
         """The frontier that is still the target (by its id, else the nearest to its place), at most one."""
-        if self._target.id < 0 or planner.frontiers.size == 0:
+        if self._target.id < 0 or not self._roads.frontiers:
             return []
-        same = planner.road_map.index_of(self._target.id)
-        if same >= 0 and same in planner.frontiers:
-            return [same]
-        offset = planner.road_map.xyz_m[planner.frontiers] - np.array(self._target.xyz_m)
-        gap_m = np.linalg.norm(offset, axis=1)
+        if self._target.id in self._roads.frontiers:
+            return [self._roads.frontiers[self._target.id]]
+        frontiers = self._roads.frontier_slots()
+        gap_m = np.linalg.norm(self._roads.xyz_m[frontiers] - np.array(self._target.xyz_m), axis=1)
         nearest = int(np.argmin(gap_m))
-        return [int(planner.frontiers[nearest])] if gap_m[nearest] <= self.config.same_target_m else []
+        return [int(frontiers[nearest])] if gap_m[nearest] <= self.config.same_target_m else []
 
-    def _keep_or_switch(self, planner: GlobalPlanner, options: list[Option], held: list[int]) -> _Choice:
+    def _keep_or_switch(self, options: list[Option], held: list[int]) -> _Choice:
         """Keep the target unless the best Q is better by both margins; options: best first."""
         best = options[0]
         kept = next((option for option in options if option.node in held), None)
         shown = tuple(options[: self.config.alternatives])
-        says = _describe(planner, best)
+        says = _describe(self._roads, best)
         if kept is None:
             why = (
                 "first target"
@@ -172,49 +168,45 @@ class GcpStage:
             return _Choice(best, f"{says}; {why}", alternatives=shown)
         margin = self._margin(kept, best)
         if best.node == kept.node or best.q <= kept.q + margin:
-            return _Choice(kept, f"{_describe(planner, kept)}; kept", alternatives=shown)
-        why = f"switched, Q {best.q:.2f} against {kept.q:.2f} of {_describe(planner, kept)}"
-        gap_m = float(np.linalg.norm(planner.road_map.xyz_m[best.node] - np.array(self._target.xyz_m)))
+            return _Choice(kept, f"{_describe(self._roads, kept)}; kept", alternatives=shown)
+        why = f"switched, Q {best.q:.2f} against {kept.q:.2f} of {_describe(self._roads, kept)}"
+        gap_m = float(np.linalg.norm(self._roads.xyz_m[best.node] - np.array(self._target.xyz_m)))
         return _Choice(best, f"{says}; {why}", gap_m > self.config.same_target_m, shown)
 
     def _margin(self, kept: Option, best: Option) -> float:
-        """How much better the best must be. A crumb that is left of the target far away is no reason to pass others."""
-        crumb = kept.gain < self.config.crumb_share * self._target.gain
-        if crumb and kept.distance_m > 2.0 * best.distance_m:
-            return self.config.crumb_margin
+        """How much better the best must be. For a crumb, whole ground is not left unseen, nor what lies before it."""
+        c = self.config
+        crumb = kept.gain < max(c.crumb_share * self._target.gain, c.crumb_gain)
+        if crumb and (kept.distance_m > 2.0 * best.distance_m or best.gain >= c.crumb_times * kept.gain):
+            return c.crumb_margin
         return max(self.config.switch_margin, self.config.switch_margin_relative * abs(kept.q))
 
-    def _remember(self, planner: GlobalPlanner, choice: _Choice) -> None:
+    def _remember(self, choice: _Choice) -> None:
         """Hold the frontier chosen; on the way home nothing is held."""
         before, self._target = self._target, _Target()
         if choice.option is not None and choice.extra_xyz_m is None:
-            xyz = planner.road_map.xyz_m[choice.option.node]
-            place = (float(xyz[0]), float(xyz[1]), float(xyz[2]))
-            name = int(planner.road_map.node_id[choice.option.node])
+            x_m, y_m, z_m = self._roads.xyz_m[choice.option.node].tolist()
+            name = int(self._roads.net.node_id[choice.option.node])
             held = before.gain if name == before.id else 0.0
-            self._target = _Target(name, place, max(held, choice.option.gain))
+            self._target = _Target(name, (x_m, y_m, z_m), max(held, choice.option.gain))
 
-    def _message(
-        self,
-        now: Stamp,
-        odometry: Odometry,
-        planner: GlobalPlanner,
-        choice: _Choice,
-        values: tuple[Values, Values],
-        robot: Floats,
-    ) -> GlobalPolicy:
-        road_map, option = planner.road_map, choice.option
+    def _message(self, now: Stamp, choice: _Choice, robot: Floats) -> GlobalPolicy:
+        roads, option, radius_m = self._roads, choice.option, self.config.policy_radius_m
         path = np.empty(0, np.int32) if option is None else option.path
-        path_node, path_xyz = road_map.node_id[path], road_map.xyz_m[path]
-        if choice.extra_xyz_m is not None:
+        path_node, path_xyz = roads.net.node_id[path], roads.xyz_m[path]
+        if choice.extra_xyz_m is not None and option is not None:
             path_node = np.append(path_node, path_node[-1:])
             path_xyz = np.vstack((path_xyz, np.array(choice.extra_xyz_m)))
         place = path_xyz[-1] if option is not None else robot
-        told = _nodes_to_tell(road_map, robot, path, self.config.policy_radius_m)
+        near = roads.near(robot, radius_m)
+        policy = self._planner.policy(near, robot, self.config.local_range_m)
+        worth = np.flatnonzero((policy.value > 0.0) | (policy.value_to_go > 0.0))
+        told, piece = _pieces_around(path_xyz, robot, radius_m)
+        route = np.unique(np.linspace(0, max(0, len(path_xyz) - 1), _ROUTE_PLACES).astype(np.int64))
         return GlobalPolicy(
             stamp_ns=now,
-            irm_version=self._mirror.version,
-            target=-1 if option is None else int(road_map.node_id[option.node]),
+            irm_version=roads.version,
+            target=-1 if option is None else int(roads.net.node_id[option.node]),
             target_xyz_m=(float(place[0]), float(place[1]), float(place[2])),
             target_gain=0.0 if option is None else option.gain,
             target_q=0.0 if option is None else option.q,
@@ -222,22 +214,24 @@ class GcpStage:
             target_risk=0.0 if option is None else option.risk,
             switched=choice.switched,
             reason=choice.reason,
-            alternatives=[_alternative(planner, other) for other in choice.alternatives],
+            alternatives=[_alternative(roads, other) for other in choice.alternatives],
             map_to_odom=self._frame,
-            node_id=road_map.node_id[told],
-            node_xyz_m=road_map.xyz_m[told],
-            action=values[0].action[told],
-            value=values[0].value[told],
-            value_to_go=values[1].value[told],
-            path_node=path_node,
-            path_xyz_m=path_xyz,
+            node_id=roads.net.node_id[near][worth],
+            node_xyz_m=roads.xyz_m[near][worth],
+            action=policy.action[worth],
+            value=policy.value[worth],
+            value_to_go=policy.value_to_go[worth],
+            path_node=path_node[told],
+            path_xyz_m=path_xyz[told],
+            path_piece=piece,
+            route_xyz_m=path_xyz[route] if len(path_xyz) else path_xyz,
         )
 
     def snapshot(self) -> bytes:
         """Graph, target and tick."""
         return pack_snapshot(
             {
-                "graph": self._mirror.snapshot(),
+                "graph": self._roads.snapshot(),
                 "target": [self._target.id, *self._target.xyz_m, self._target.gain],
                 "tick": self._tick,
                 "asked_ns": self._asked_ns,
@@ -248,7 +242,7 @@ class GcpStage:
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot."""
         state = unpack_snapshot(snapshot)
-        self._mirror.restore(state["graph"])
+        self._roads.restore(state["graph"])
         target, x_m, y_m, z_m, gain = state["target"]
         self._target = _Target(target, (x_m, y_m, z_m), gain)
         self._tick, self._asked_ns = state["tick"], state["asked_ns"]
@@ -267,13 +261,20 @@ class GcpStage:
         self._target, self._tick = _Target(target, (x_m, y_m, z_m), gain), state["tick"]
 
 
-def _nodes_to_tell(
-    road_map: RoadMap, robot: Floats, path: NDArray[np.int32], radius_m: float
-) -> NDArray[np.int64]:
-    """Indices, ascending, of the nodes around the robot and on its path: what readers need, however large the graph."""
-    near = np.square(road_map.xyz_m - robot).sum(axis=1) <= radius_m**2
-    near[path] = True
-    return np.flatnonzero(near)
+def _pieces_around(path_xyz_m: Floats, robot: Floats, radius_m: float) -> tuple[NDArray[np.int64], Slots]:
+    """The places of a path around the robot with the next ones outside, and the number of the piece of each.
+
+    A way may leave the robot's surroundings and come back: what readers need of it stays small, however long it is.
+    The first place is always among them.
+    """
+    near = np.square(path_xyz_m - robot).sum(axis=1) <= radius_m**2
+    near[:1] = True
+    told = near.copy()
+    told[1:] |= near[:-1]
+    told[:-1] |= near[1:]
+    places = np.flatnonzero(told)
+    apart = np.diff(places, prepend=places[:1]) > 1
+    return places, np.cumsum(apart).astype(np.int32)
 
 
 def _robot_xyz(frame: Pose, pose: Pose) -> tuple[float, float, float]:
@@ -282,16 +283,16 @@ def _robot_xyz(frame: Pose, pose: Pose) -> tuple[float, float, float]:
     return x_m, y_m, frame.z_m + pose.z_m
 
 
-def _describe(planner: GlobalPlanner, option: Option) -> str:
+def _describe(roads: RoadNet, option: Option) -> str:
     """ "frontier 41: gain 3.2, 12 m, risk 0.01"."""
-    node = int(planner.road_map.node_id[option.node])
+    node = int(roads.net.node_id[option.node])
     return f"frontier {node}: gain {option.gain:.1f}, {option.distance_m:.0f} m, risk {option.risk:.2f}"
 
 
-def _alternative(planner: GlobalPlanner, option: Option) -> Alternative:
-    x_m, y_m, _ = planner.road_map.xyz_m[option.node].tolist()
+def _alternative(roads: RoadNet, option: Option) -> Alternative:
+    x_m, y_m, _ = roads.xyz_m[option.node].tolist()
     return Alternative(
-        frontier=int(planner.road_map.node_id[option.node]),
+        frontier=int(roads.net.node_id[option.node]),
         x_m=x_m,
         y_m=y_m,
         gain=option.gain,
@@ -302,22 +303,26 @@ def _alternative(planner: GlobalPlanner, option: Option) -> Alternative:
 
 
 def warm_up() -> None:
-    """Compile the kernels: one breadcrumb, one frontier, one edge."""
-    two, both = np.zeros(2), np.array([1, 0], np.int32)
-    road_map = RoadMap(
-        np.arange(2),
-        np.array([0, 1], np.uint8),
-        np.zeros((2, 3)),
-        two,
-        two.astype(np.float32),
-        np.array([0, 1, 2], np.int32),
-        both,
-        two,
-        two,
-        two.astype(np.uint8),
+    """Compile the kernels: a breadcrumb between two frontiers; one of these and an edge are gone; all is back."""
+    nodes, edges = np.array([1, 2, 3]), np.array([[1, 2], [2, 3]])
+    nothing = np.empty(0, np.int64)
+    xyz = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    kind, gain = np.array([1, 0, 1], np.uint8), np.array([1.0, 0.0, 1.0])
+    ones = np.ones(2)
+    graph = Graph(
+        1, 0, 2, nodes, kind, xyz, gain, edges[:, 0], edges[:, 1], ones, ones * 0.1, nothing, edges[:0]
     )
-    planner = GlobalPlanner(road_map, RewardWeights())
-    planner.options(Belief(np.zeros((1, 3)), 0), [], 1)
-    planner.values()
-    planner.values_to_go(np.zeros(3), 1.0)
-    planner.way_home(0, 0)
+    smaller = graph._replace(
+        irm_version=2, base_version=1, node_id=nodes[:0], node_kind=kind[:0], node_xyz_m=xyz[:0], node_gain=gain[:0],
+        edge_a=nothing, edge_b=nothing, edge_distance_m=ones[:0], edge_risk=ones[:0], removed_node=nodes[2:],
+        removed_edge=edges[:1],
+    )  # fmt: skip
+    roads = RoadNet(RewardWeights())
+    planner = GlobalPlanner(roads)
+    for message in (graph, smaller, graph._replace(irm_version=3, base_version=2)):
+        roads.apply(message)
+        planner.follow()
+        middle = roads.slot_of(2)
+        planner.options(Belief(np.zeros((1, 3)), middle), [], 1)
+        planner.policy(roads.near(np.zeros(3), 2.0), np.zeros(3), 0.5)
+        planner.way_home(middle, roads.slot_of(1))

@@ -340,3 +340,26 @@ def halve(
                     total += mass[r, c]
             out_opaque[row, column] = blocked >= 2
             out_mass[row, column] = total
+
+
+@njit
+def halve_heights(
+    ground_m: NDArray[np.float32],
+    top_m: NDArray[np.float32],
+    out_ground_m: NDArray[np.float32],
+    out_top_m: NDArray[np.float32],
+) -> None:
+    """Heights at half the resolution: the mean of the ground, and of the tops the second highest of four."""
+    for row in range(out_ground_m.shape[0]):
+        for column in range(out_ground_m.shape[1]):
+            total = np.float32(0.0)
+            first, second = np.float32(-np.inf), np.float32(-np.inf)
+            for r in range(2 * row, 2 * row + 2):
+                for c in range(2 * column, 2 * column + 2):
+                    total += ground_m[r, c]
+                    if top_m[r, c] > first:
+                        first, second = top_m[r, c], first
+                    elif top_m[r, c] > second:
+                        second = top_m[r, c]
+            out_ground_m[row, column] = np.float32(0.25) * total
+            out_top_m[row, column] = second

@@ -192,10 +192,11 @@ class LcpStage:
             return _nothing(now, request, "no target" if policy is None else policy.reason)
         to_odom = planar(policy.map_to_odom).inverse()
         places = [to_odom.apply(float(x), float(y)) for x, y, _ in policy.path_xyz_m]
+        way = _densify(places, policy.path_piece.tolist())
         p = parameters(self._config.weights)
         # A way that is riskier than any other planner would take is still better than to stand in a pocket.
         for max_risk in (_MAX_RISK, 1.0):
-            for x, y in reversed(_densify(places)):
+            for x, y in reversed(way):
                 node = node_at(irm, x, y)
                 if node < 0 or irm.state[node] != 1 or node == junction.node:
                     continue
@@ -251,10 +252,13 @@ def _near_reach(irm: LocalIrm, cost: np.ndarray, radius_m: float) -> np.ndarray:
     return grown.ravel()
 
 
-def _densify(places: list[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Points every half metre along a path."""
+def _densify(places: list[tuple[float, float]], pieces: list[int]) -> list[tuple[float, float]]:
+    """Points every half metre along the pieces of a path; none where it runs from one piece to the next."""
     dense = places[:1]
-    for (x0, y0), (x1, y1) in pairwise(places):
+    for ((x0, y0), (x1, y1)), (before, after) in zip(pairwise(places), pairwise(pieces), strict=True):
+        if before != after:
+            dense.append((x1, y1))
+            continue
         steps = max(1, int(np.ceil(np.hypot(x1 - x0, y1 - y0) / 0.5)))
         dense += [(x0 + (x1 - x0) * i / steps, y0 + (y1 - y0) * i / steps) for i in range(1, steps + 1)]
     return dense

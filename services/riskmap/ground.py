@@ -9,7 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.kernels import njit, njit_borrowing
-from services.riskmap.cells import BELOW, CEILING_SEEN, HIT_WEIGHT, LOG_ODDS, MEAN, SEEN, TRAVELLED, VARIANCE
+from services.riskmap.cells import (
+    BELOW,
+    CEILING,
+    CEILING_SEEN,
+    HIT_WEIGHT,
+    LOG_ODDS,
+    MEAN,
+    SEEN,
+    TRAVELLED,
+    VARIANCE,
+)
 from services.riskmap.sweep import BEARINGS, Sweep
 
 NOTHING, GROUND, ABOVE, OVERHEAD = 0, 1, 2, 3
@@ -241,6 +251,10 @@ def _fuse(cell: NDArray[np.float32], z: float, noise: float, points: float, rule
             cell[CEILING_SEEN] = 0.0  # another storey
     cell[MEAN], cell[VARIANCE] = z, noise
     cell[SEEN], cell[TRAVELLED] = points, rules.travelled_m
+    # Ground that rises before the robot is taken for something overhead, while what leads there is unknown. What is
+    # truly as low will be hit again, as an obstacle over this ground.
+    if cell[CEILING_SEEN] > 0.0 and cell[CEILING] - z <= rules.height_m:
+        cell[CEILING_SEEN] = 0.0
     if cell[HIT_WEIGHT] == 0.0:
         cell[LOG_ODDS] = max(cell[LOG_ODDS] - rules.pass_log_odds, -rules.hit_log_odds)
 

@@ -60,6 +60,10 @@ class Model(Protocol):
         """The risk layers and the ground's height."""
         ...
 
+    def tops(self, ground_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Height of the ground or of what stands on it, (h, w); (0, 0) where heights are not known."""
+        ...
+
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
         ...
@@ -162,6 +166,7 @@ class RiskMapStage:
             robot_pose=self._pose,
             footprint_radius_m=self._config.footprint_radius_m,
             elevation_m=elevation_m,
+            top_m=self._model.tops(elevation_m),
             **layers._asdict(),
         )
 
@@ -205,4 +210,4 @@ def warm_up() -> None:
     for model in (FlatModel(Config(window_m=6.0)), TerrainModel(Config(model="terrain", window_m=6.0))):
         model.integrate(cloud)
         model.apply_grid(grid, Pose(), only_new=True)
-        model.layers(Pose())
+        model.tops(model.layers(Pose())[1])

@@ -47,7 +47,9 @@ def _pairs(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """(n, 2) rows and columns from a pair's first cell to its second; (n,) what slope explains at most, m; and (m, 3)
     the pairs that count at a cell: which, and rows and columns from the cell to its first cell, in their order."""
-    pairs, most, turns = [], [], []
+    pairs: list[tuple[int, int]] = []
+    most: list[float] = []
+    turns: list[tuple[int, int, int]] = []
     for dr, dc in _DIRECTIONS:
         length = resolution_m * (math.sqrt(2.0) if dr != 0 and dc != 0 else 1.0)
         for n in range(1, reach + 1):

@@ -33,6 +33,7 @@ from services.riskmap.ring import RingWindow
 from services.riskmap.standing import stand_here, start_ground, suppose_start
 from services.riskmap.sweep import read_sweep
 from services.riskmap.terrain import Ground, TerrainMetrics, close_holes, spread_heights, terrain_metrics
+from services.riskmap.tops import tops
 
 
 class TerrainModel:
@@ -133,6 +134,10 @@ class TerrainModel:
         layers = hazard_layers(metrics, obstacles, limits, s.resolution_m, c.alpha, c.max_clearance_m)
         spread_heights(height_m, ground, robot.z_m - c.base_height_m)
         return layers, height_m
+
+    def tops(self, ground_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Height of the ground or of what stands on it, (h, w) m."""
+        return tops(self._window.cells, self._window.origin, ground_m, self._config.robot_height_m)
 
     def metrics(
         self,

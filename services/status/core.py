@@ -251,7 +251,7 @@ class StatusCore:
             plan=self._plan_in_map(),
             frontiers=tuple((float(x), float(y)) for x, y in frontiers),
             target=None if policy is None or policy.target < 0 else policy.target_xyz_m[:2],
-            route=() if policy is None else tuple((float(x), float(y)) for x, y, _ in policy.path_xyz_m),
+            route=() if policy is None else tuple((float(x), float(y)) for x, y, _ in policy.route_xyz_m),
             title=self._title(),
         )
 

@@ -159,7 +159,10 @@ def test_a_real_campaign_repeats_itself(tmp_path: Path) -> None:
         outcome = run_campaign(campaign, out, 2)
         assert outcome.complete, outcome
         assert {row["status"] for row in outcome.table} == {FINISHED}, outcome.table
-        assert all(row["coverage"] > 0.05 and row["mission_s"] == 3.0 for row in outcome.table)
+        assert all(
+            row["coverage"] > 0.05 and row["mission_s"] == pytest.approx(3.0, abs=0.6)
+            for row in outcome.table
+        )
         assert CRASHED not in (tmp_path / out / "runs.csv").read_text(encoding="utf-8")
         return {row["seed"]: row["digest"] for row in outcome.table}
 

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from services.gcp import alternatives, qmdp
+from services.gcp import qmdp
+from tests.gcp import frontier_values as alternatives
 
 
 class Case(NamedTuple):

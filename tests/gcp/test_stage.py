@@ -16,7 +16,7 @@ from schemas.policy import GlobalPolicy
 from schemas.sensing import Odometry
 from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION, ODOMETRY
 from schemas.world import GlobalIrm
-from services.gcp import alternatives, qmdp
+from services.gcp import field, planner, ranking, roadnet
 from services.gcp.stage import Config, GcpStage, spec, warm_up
 
 Node = tuple[int, float, float, float]  # kind, x, y, gain
@@ -121,7 +121,7 @@ class Bench:
 
 
 def test_goes_to_the_frontier_that_pays_most() -> None:
-    policy = Bench().step((GLOBAL_IRM, fork()))
+    policy = Bench(policy_radius_m=60.0).step((GLOBAL_IRM, fork()))
     assert policy.target == 11
     assert policy.target_xyz_m == (0.0, 30.0, 0.0)
     assert policy.path_node.tolist() == [1, 11]
@@ -198,7 +198,8 @@ def test_by_default_a_target_is_kept_for_one_that_is_better_by_ten_nats() -> Non
 
 
 @pytest.mark.parametrize(
-    ("left", "near_m", "switches"), [(0.5, 10.0, True), (5.0, 10.0, False), (0.5, 30.0, False)]
+    ("left", "near_m", "switches"),
+    [(0.5, 10.0, True), (5.0, 10.0, False), (0.9, 30.0, False), (0.5, 30.0, True)],
 )
 def test_a_crumb_of_a_far_target_is_no_reason_to_pass_others(
     left: float, near_m: float, switches: bool
@@ -268,7 +269,7 @@ def test_without_frontiers_there_is_no_target() -> None:
     policy = Bench().step((GLOBAL_IRM, graph(1, nodes, {(1, 2): (10.0, 0.0)})))
     assert policy.target == -1
     assert policy.reason == "no target: no frontier is left"
-    assert policy.action.tolist() == [-1, -1]
+    assert policy.node_id.size == 0
     assert policy.path_node.size == 0
 
 
@@ -281,7 +282,7 @@ def test_frontiers_out_of_reach_are_no_target() -> None:
 
 def test_value_to_go_leaves_out_what_is_near() -> None:
     """From breadcrumb 5, 5 m from frontier 10, only frontier 11 counts for the rest of the mission."""
-    bench = Bench(local_range_m=18.0)
+    bench = Bench(local_range_m=18.0, policy_radius_m=60.0)
     policy = bench.step((GLOBAL_IRM, fork(robot_node=5)), (ODOMETRY, odometry(40.0)))
     value = dict(zip(policy.node_id.tolist(), policy.value.tolist(), strict=True))
     to_go = dict(zip(policy.node_id.tolist(), policy.value_to_go.tolist(), strict=True))
@@ -289,9 +290,39 @@ def test_value_to_go_leaves_out_what_is_near() -> None:
     assert value[5] > to_go[5]
     assert to_go[1] == pytest.approx(value[1])
     assert to_go[1] > to_go[2] > to_go[5]
-    alone = Bench(local_range_m=100.0)
+    alone = Bench(local_range_m=100.0, policy_radius_m=60.0)
     policy = alone.step((GLOBAL_IRM, fork(robot_node=5)), (ODOMETRY, odometry(40.0)))
     assert policy.value_to_go.tolist() == [0.0] * 7
+
+
+def hook(version: int = 1) -> GlobalIrm:
+    """A way of 200 m out along y = 0 and back along y = 10, to a frontier 10 m beside the robot."""
+    nodes: dict[int, Node] = {1 + i: (CRUMB, 10.0 * i, 0.0, 0.0) for i in range(21)}
+    nodes |= {22 + i: (CRUMB, 200.0 - 10.0 * i, 10.0, 0.0) for i in range(20)}
+    nodes[42] = (FRONTIER, 0.0, 10.0, 50.0)
+    return graph(version, nodes, {(i, i + 1): (10.0, 0.0) for i in range(1, 42)})
+
+
+def test_of_the_way_is_told_what_lies_around_the_robot() -> None:
+    policy = Bench(policy_radius_m=32.0).step((GLOBAL_IRM, hook()))
+    assert policy.target_distance_m == pytest.approx(410.0)
+    assert policy.path_node.tolist() == [1, 2, 3, 4, 5, 38, 39, 40, 41, 42]
+    assert policy.path_piece.tolist() == [0] * 5 + [1] * 5
+    assert policy.path_xyz_m[4].tolist() == [40.0, 0.0, 0.0]
+    assert len(policy.route_xyz_m) == 16
+    assert policy.route_xyz_m[0].tolist() == [0.0, 0.0, 0.0]
+    assert policy.route_xyz_m[-1].tolist() == [0.0, 10.0, 0.0]
+
+
+def test_a_message_does_not_grow_with_the_way() -> None:
+    """Ten times as many tunnels behind, and the way ten times as long: the same bytes but for a few digits."""
+    sizes = []
+    for crumbs in (100, 1000):
+        nodes: dict[int, Node] = {1 + i: (CRUMB, 5.0 * i, 0.0, 0.0) for i in range(crumbs)}
+        nodes[crumbs + 1] = (FRONTIER, 5.0 * crumbs, 0.0, 50.0)
+        message = graph(1, nodes, {(i, i + 1): (5.0, 0.0) for i in range(1, crumbs + 1)})
+        sizes.append(len(encode(Bench().step((GLOBAL_IRM, message)), Envelope("husky1", "gcp", 1, 1, 0))))
+    assert sizes[1] <= sizes[0] + 8
 
 
 def test_way_home() -> None:
@@ -373,7 +404,8 @@ def test_spec_and_unknown_keys() -> None:
 def test_warm_up_compiles_what_a_step_uses() -> None:
     """After it a step compiles nothing: the kernels get no new signatures."""
     warm_up()
-    kernels = [k for m in (qmdp, alternatives) for k in vars(m).values() if hasattr(k, "signatures")]
+    modules = (field, planner, ranking, roadnet)
+    kernels = [k for m in modules for k in vars(m).values() if hasattr(k, "signatures")]
     before = [len(kernel.signatures) for kernel in kernels]
     bench = Bench()
     bench.step((GLOBAL_IRM, fork()))

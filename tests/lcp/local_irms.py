@@ -92,8 +92,11 @@ def global_policy(
     path: Sequence[tuple[float, float]],
     map_to_odom: Pose | None = None,
     values: Sequence[tuple[float, float, float]] = (),
+    pieces: Sequence[int] | None = None,
 ) -> GlobalPolicy:
-    """A global policy whose target is the end of the path (none for an empty one). values: (x, y, value to go)."""
+    """A global policy whose target is the end of the path (none for an empty one). values: (x, y, value to go). pieces:
+    of the path, by default one.
+    """
     target = (*path[-1], 0.0) if path else (0.0, 0.0, 0.0)
     k, n = len(path), len(values)
     return GlobalPolicy(
@@ -116,6 +119,8 @@ def global_policy(
         value_to_go=np.array([v for _, _, v in values], np.float64),
         path_node=np.arange(k, dtype=np.int64),
         path_xyz_m=np.array([(x, y, 0.0) for x, y in path], np.float64).reshape(-1, 3),
+        path_piece=np.array([0] * k if pieces is None else pieces, np.int32),
+        route_xyz_m=np.array([(x, y, 0.0) for x, y in path], np.float64).reshape(-1, 3),
     )
 
 

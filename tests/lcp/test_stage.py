@@ -169,6 +169,18 @@ def test_a_target_behind_a_wall_is_guided_to_even_when_it_is_near() -> None:
     assert int(found.path_lattice[-1, 0]) - IX0 == 8
 
 
+@pytest.mark.parametrize(("pieces", "ends_at"), [((0, 0, 0, 0), 8), ((0, 0, 1, 1), 0)])
+def test_nothing_is_said_of_the_way_between_two_pieces(pieces: tuple[int, ...], ends_at: int) -> None:
+    """The way leaves the window on one side and comes back far behind the other: the straight line is no way."""
+    lattice = corridor({})
+    feed = feed_of(lattice)
+    feed.put(GLOBAL_POLICY, global_policy([at(2), at(-9), at(30), at(40)], pieces=pieces), 0)
+    found = answer(feed, request(lattice, 4 * SIZE + 2))
+    assert found is not None
+    assert found.phase is LocalPhase.GUIDE
+    assert int(found.path_lattice[-1, 0]) - IX0 == ends_at
+
+
 def test_the_global_path_is_in_map_and_the_lattice_in_odom() -> None:
     lattice = corridor({})
     feed = feed_of(lattice)

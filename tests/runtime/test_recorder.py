@@ -34,7 +34,7 @@ def _policy(switched: bool) -> GlobalPolicy:
         target_distance_m=6.0, target_risk=0.0, switched=switched, reason="because", alternatives=[],
         map_to_odom=Pose(), node_id=np.zeros(0, np.int64), node_xyz_m=np.zeros((0, 3)),
         action=np.zeros(0, np.int64), value=np.zeros(0), value_to_go=np.zeros(0), path_node=np.zeros(0, np.int64),
-        path_xyz_m=np.zeros((0, 3)),
+        path_xyz_m=np.zeros((0, 3)), path_piece=np.zeros(0, np.int32), route_xyz_m=np.zeros((0, 3)),
     )  # fmt: skip
 
 

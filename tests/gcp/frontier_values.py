@@ -1,4 +1,4 @@
-"""What each frontier is worth from where the robot stands: the best alternatives and the reasons for the choice."""
+"""What each frontier is worth from where the robot stands, from the whole graph: a reference."""
 
 from __future__ import annotations
 
