@@ -35,7 +35,7 @@ def _pair_by_pair(
                 r1, c1 = r + n * dr, c + n * dc
                 if not is_known(r1, c1):
                     continue
-                rise = float(height_m[r1, c1]) - float(height_m[r, c])
+                rise = float(height_m[r1, c1] - height_m[r, c])
                 if is_known(r - n * dr, c - n * dc) and is_known(r1 + n * dr, c1 + n * dc):
                     sign = 1.0 if rise > 0.0 else -1.0
                     before = sign * float(height_m[r, c] - height_m[r - n * dr, c - n * dc])
