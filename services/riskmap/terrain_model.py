@@ -24,8 +24,9 @@ from services.riskmap.cells import (
 from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
 from services.riskmap.extrinsics import base_in_odom, body_box, transform, without_body
+from services.riskmap.gaps import join_rings
 from services.riskmap.grid_layers import grid_layers
-from services.riskmap.ground import GroundRules, fuse_ground, join_rings, upright, walk
+from services.riskmap.ground import GroundRules, fuse_ground, upright, walk
 from services.riskmap.hazard import Limits, Obstacles, hazard_layers
 from services.riskmap.obstacles import add_hits, clear_pierced
 from services.riskmap.ready_grid import grid_evidence
