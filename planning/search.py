@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from planning.footprint import _min_clearance_above, segment_risk
 from planning.grid import DIRECTION_DX, DIRECTION_DY
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 
 _DX = DIRECTION_DX
 _DY = DIRECTION_DY
 
 
-@njit
+@njit_borrowing
 def heap_lift(heap: NDArray[np.int32], place: NDArray[np.int32], key: NDArray[np.float64], slot: int) -> None:
     """Move the item at `slot` of a min-heap up to where its key belongs; `place` is the inverse of `heap`."""
     item = heap[slot]
@@ -34,7 +34,7 @@ def heap_lift(heap: NDArray[np.int32], place: NDArray[np.int32], key: NDArray[np
     place[item] = slot
 
 
-@njit
+@njit_borrowing
 def heap_pop(heap: NDArray[np.int32], place: NDArray[np.int32], key: NDArray[np.float64], size: int) -> int:
     """Remove and return the item of the smallest key from a min-heap of `size` items."""
     first = heap[0]
@@ -60,7 +60,7 @@ def heap_pop(heap: NDArray[np.int32], place: NDArray[np.int32], key: NDArray[np.
     return first
 
 
-@njit
+@njit_borrowing
 def heap_push_or_lower(
     heap: NDArray[np.int32],
     place: NDArray[np.int32],

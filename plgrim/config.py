@@ -165,7 +165,7 @@ def is_rough(sim: Mapping[str, Any]) -> bool:
 DOWNWARD_LIDAR = {"rings": 24, "elevation_min_deg": -45.0, "elevation_max_deg": 15.0}
 """For rough ground: with the default, no ring meets the ground nearer than 3 m, nor any way down at all."""
 
-ROUGH_WORLDS = ("cave", "lava_tube")
+ROUGH_WORLDS = ("cave", "lava_tube", "short_lava_tube")
 """Built-in worlds whose ground is not flat."""
 
 

@@ -141,10 +141,17 @@ def _last_words(recorder: MissionRecorder, stop: threading.Event, update: Callab
             return
 
 
-def run_lockstep(config: Config, out_dir: Path, console: Console, limit_s: float = 0.0) -> Result:
+def run_lockstep(
+    config: Config,
+    out_dir: Path,
+    console: Console,
+    limit_s: float = 0.0,
+    each_second: Callable[[MissionRecorder], None] | None = None,
+) -> Result:
     """Run the mission in this process under a virtual clock, as fast as the machine can; write and give the result.
 
-    limit_s: stop after so much mission time (0: the mission's own end). Ctrl-C ends it early, with a result.
+    limit_s: stop after so much mission time, in whole seconds (0: the mission's own end). Ctrl-C ends it early,
+    with a result. each_second: called after every second of mission time, to watch from outside.
     """
     from plgrim.runtime.lockstep import Lockstep
 
@@ -158,10 +165,13 @@ def run_lockstep(config: Config, out_dir: Path, console: Console, limit_s: float
             while not recorder.finished and not (limit_s and lockstep.now >= limit_s * SECOND_NS):
                 lockstep.run_until(lockstep.now + SECOND_NS)
                 progress.update()
+                if each_second is not None:
+                    each_second(recorder)
                 lost_ns += SECOND_NS if recorder.lost else 0
                 if lost_ns > _LOST_GRACE_S * SECOND_NS:
                     break
-            lockstep.run_until(lockstep.now + int(_LAST_WORDS_S) * SECOND_NS)
+            end = lockstep.now + int(_LAST_WORDS_S) * SECOND_NS
+            lockstep.run_until(max(lockstep.now, min(end, int(limit_s * SECOND_NS))) if limit_s else end)
         except KeyboardInterrupt:
             console.print("interrupted: writing the result so far")
     wall_s = time.monotonic() - began

@@ -120,6 +120,8 @@ def summary_table(result: Mapping[str, Any]) -> Table:
         ("contacts", str(result["contacts"])),
         ("cloud to plan", f"p50 {p50}, p95 {p95} of mission time"),
     ]  # fmt: skip
+    if "tour" in result:
+        rows += _tour_rows(result)
     if "times_real_time" in result:
         rows.append(("speed", f"{result['times_real_time']:.1f} times real time"))
     if result["restarts"]:
@@ -127,6 +129,16 @@ def summary_table(result: Mapping[str, Any]) -> Table:
     for name, value in rows:
         table.add_row(name, value)
     return table
+
+
+def _tour_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The mission beside a tour that knows the map."""
+    tour = result["tour"]
+    return [
+        ("covered area", _number(result["covered_area_m2"], "m2")),
+        ("a tour that knows the map", f"{_number(tour['covered_area_m2'], 'm2')} in the same time"),
+        ("ratio", _percent(tour["ratio"])),
+    ]
 
 
 def stage_table(result: Mapping[str, Any]) -> Table:

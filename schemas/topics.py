@@ -68,7 +68,7 @@ COVERAGE_SCAN: Topic[CoverageScan] = _topic(
     max_bytes=4 * _KIB, link=True,
 )  # fmt: skip
 FOLLOWER: Topic[FollowerState] = _topic(
-    FollowerState, "sim/follower", "reconciler irm", "progress and trouble of the path follower", period_ms=50,
+    FollowerState, "sim/follower", "riskmap reconciler irm", "progress and trouble of the path follower", period_ms=50,
     stale_ms=1000, max_bytes=4 * _KIB,
 )  # fmt: skip
 JUDGE: Topic[JudgeReport] = _topic(

@@ -23,11 +23,13 @@ class RiskMap(Message):
     """Belief about traversal risk W_r around the robot, in `odom`. stamp: that of the newest cloud in it.
 
     state: 0 unknown, 1 free, 2 lethal. hazard_*: hazard rate per metre travelled (mean, variance, CVaR), 1/m.
-    clearance_m: distance from the cell's centre to the nearest lethal surface. elevation_m: ground height.
-    All (h, w), row 0 the lowest y.
+    clearance_m: distance from the cell's centre to the nearest lethal surface. elevation_m: ground height. top_m:
+    height of the ground or of what stands on it, over which a sensor has to look; (0, 0) when the risk map knows no
+    heights, and every cell that is not free blocks the sight. All (h, w), row 0 the lowest y.
     """
 
     schema_name: ClassVar[str] = "risk_map"
+    schema_version: ClassVar[int] = 2
 
     grid: GridHeader
     robot_pose: Pose
@@ -38,6 +40,7 @@ class RiskMap(Message):
     hazard_cvar: Annotated[Array, column("float32", "h", "w", minimum=0)]
     clearance_m: Annotated[Array, column("float32", "h", "w", minimum=0)]
     elevation_m: Annotated[Array, column("float32", "h", "w")]
+    top_m: Annotated[Array, column("float32", "top_h", "top_w")]
 
 
 class LocalIrm(Message):

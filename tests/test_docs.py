@@ -42,12 +42,16 @@ def code_lines(text: str) -> list[str]:
 
 
 def commands() -> dict[str, set[str]]:
-    """The options of each command of the program."""
+    """The options of each command of the program; a group of commands has those of all its commands."""
     group: Any = typer.main.get_command(application)  # of typer's own copy of click
-    return {
-        name: {"--help", *(option for parameter in command.params for option in parameter.opts)}
-        for name, command in group.commands.items()
-    }
+    return {name: options(command) for name, command in group.commands.items()}
+
+
+def options(command: Any) -> set[str]:
+    """Of a command and of those below it."""
+    below = getattr(command, "commands", {}).values()
+    own = {option for parameter in command.params for option in parameter.opts}
+    return {"--help"}.union(own, *(options(inner) for inner in below))
 
 
 def calls(text: str) -> list[tuple[str, str]]:

@@ -8,7 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from plgrim.commands.options import ConfigFile, DemFile, MeshFile, OutFolder, Robot, Speed, put
+from plgrim.commands.options import (
+    ConfigFile,
+    DemFile,
+    MapFile,
+    MeshFile,
+    OutFolder,
+    Robot,
+    Seed,
+    Speed,
+    StartAt,
+    WorldName,
+    put,
+    world_overrides,
+)
 
 if TYPE_CHECKING:
     from plgrim.config import Config
@@ -24,45 +37,35 @@ def demo(
 ) -> None:
     """Explore a built-in world, every service a process of its own; exit 0 when it was covered."""
     overrides: dict[str, Any] = {"seed": seed, "clock": {"speed": speed}, "sim": {"world": _DEMO_WORLD}}
-    _live(_prepare(config_file, overrides), out)
+    _live(prepare(config_file, overrides), out)
 
 
 def explore(
-    world: Annotated[str | None, typer.Option(help="Built-in world: subway_1x, subway_2x, ...")] = None,
-    map_file: Annotated[
-        Path | None, typer.Option("--map", help="ROS map_server YAML file instead of a built-in world.")
-    ] = None,
+    world: WorldName = None,
+    map_file: MapFile = None,
     mesh: MeshFile = None,
     dem: DemFile = None,
     robot: Robot = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the world and of every random stream.")] = None,
-    start: Annotated[
-        tuple[float, float] | None, typer.Option(metavar="X Y", help="Start in the map's frame, m.")
-    ] = None,
+    seed: Seed = None,
+    start: StartAt = None,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="One process, virtual clock.")] = False,
     speed: Speed = None,
     time_budget: Annotated[float | None, typer.Option(min=1, help="Mission time, s.")] = None,
+    peer_tour: Annotated[
+        bool, typer.Option("--peer-tour", help="Compare with what a tour that knows the map covers.")
+    ] = False,
     out: OutFolder = Path("out/explore"),
     config_file: ConfigFile = None,
 ) -> None:
     """Explore a world, a map, a mesh or a height image until it is covered; exit 0 when it was."""
-    if sum(given is not None for given in (world, map_file, mesh, dem)) > 1:
-        raise typer.BadParameter("--world, --map, --mesh and --dem exclude each other")
-    overrides: dict[str, Any] = {}
-    put(overrides, "seed", seed)
+    overrides = world_overrides(world, map_file, mesh, dem, robot, seed, start)
     put(overrides, "clock.speed", speed)
-    put(overrides, "sim.world", world)
-    put(overrides, "sim.map_file", None if map_file is None else str(map_file.resolve()))
-    put(overrides, "sim.mesh_file", None if mesh is None else str(mesh.resolve()))
-    put(overrides, "sim.dem_file", None if dem is None else str(dem.resolve()))
-    put(overrides, "profile", robot)
-    put(overrides, "sim.start", None if start is None else {"x_m": start[0], "y_m": start[1]})
     put(overrides, "mission.time_budget_s", time_budget)
-    config = _prepare(config_file, overrides)
+    config = prepare(config_file, overrides)
     if lockstep:
-        _lockstep(config, out)
+        _lockstep(config, out, peer_tour)
     else:
-        _live(config, out)
+        _live(config, out, peer_tour=peer_tour)
 
 
 def up(
@@ -74,7 +77,7 @@ def up(
     """Start the router and all services as configured, and watch over them until the mission's end or Ctrl-C."""
     overrides: dict[str, Any] = {}
     put(overrides, "clock.speed", speed)
-    _live(_prepare(config_file, overrides), out, until_end=not keep)
+    _live(prepare(config_file, overrides), out, until_end=not keep)
 
 
 def watch(out: OutFolder = Path("out/watch"), config_file: ConfigFile = None) -> None:
@@ -85,13 +88,13 @@ def watch(out: OutFolder = Path("out/watch"), config_file: ConfigFile = None) ->
 
     die_with_parent()
     configure_logs("watch")
-    config = _prepare(config_file, {}, with_world=False)
+    config = prepare(config_file, {}, with_world=False)
     with stop_on_signals() as stop:
         result = watch_mission(config, out, stop, _console())
     _finish(result, out)
 
 
-def _prepare(config_file: Path | None, overrides: dict[str, Any], with_world: bool = True) -> Config:
+def prepare(config_file: Path | None, overrides: dict[str, Any], with_world: bool = True) -> Config:
     """The whole configuration, every section checked, and the world built once: before anything starts."""
     from plgrim.config import check_all, check_service, load_config
     from plgrim.registry import check_world
@@ -109,7 +112,7 @@ def _console() -> Any:
     return Console()
 
 
-def _live(config: Config, out: Path, until_end: bool = True) -> None:
+def _live(config: Config, out: Path, until_end: bool = True, peer_tour: bool = False) -> None:
     import time
 
     from plgrim.logs import configure_logs
@@ -127,15 +130,36 @@ def _live(config: Config, out: Path, until_end: bool = True) -> None:
         config = config.model_copy(update={"clock": clock})
     with stop_on_signals() as stop:
         result = run_live(config, out, stop, _console(), until_end)
-    _finish(result, out)
+    _finish(_beside_tour(config, result, out) if peer_tour else result, out)
 
 
-def _lockstep(config: Config, out: Path) -> None:
+def _lockstep(config: Config, out: Path, peer_tour: bool) -> None:
     from plgrim.logs import configure_logs
     from plgrim.missions import run_lockstep
 
     configure_logs("plgrim")
-    _finish(run_lockstep(config, out, _console()), out)
+    result = run_lockstep(config, out, _console())
+    _finish(_beside_tour(config, result, out) if peer_tour else result, out)
+
+
+def _beside_tour(config: Config, result: dict[str, Any], out: Path) -> dict[str, Any]:
+    """The result with what a tour that knows the map covers in the same time; also in result.json."""
+    import json
+
+    from plgrim.config import check_service
+    from plgrim.evaluation.tour import TourError, compare, peer_tour
+    from services.sim.config import SimConfig
+
+    options = check_service(config, "sim")
+    assert isinstance(options, SimConfig)
+    try:
+        tour = peer_tour(options, float(result["elapsed_s"] or 0.0), lambda text: print(text, flush=True))
+    except TourError as error:  # the mission's own result is not lost with it
+        print(f"plgrim: no peer: {error}", file=sys.stderr)
+        return result
+    compared = compare(result, tour)
+    (out / "result.json").write_text(json.dumps(compared, indent=2) + "\n", encoding="utf-8")
+    return compared
 
 
 def _finish(result: dict[str, Any], out: Path) -> None:

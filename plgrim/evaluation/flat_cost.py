@@ -135,6 +135,7 @@ class Tunnels:
             hazard_cvar=hazard,
             clearance_m=np.where(self.seen[part], self.clearance_m[part], np.float32(2.0)),
             elevation_m=zeros,
+            top_m=np.zeros((0, 0), np.float32),
         )
 
 

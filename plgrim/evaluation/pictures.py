@@ -37,8 +37,8 @@ def coverage_plot(path: Path, judge: Series, belief: Series) -> None:
     figure.savefig(path, dpi=110)
 
 
-def map_picture(path: Path, picture: WorldPicture, driven: Series, title: str) -> None:
-    """The world (solid, free, reachable, covered) with the driven path; metres in `map`."""
+def map_picture(path: Path, picture: WorldPicture, driven: Series, title: str, stops: Series = ()) -> None:
+    """The world (solid, free, reachable, covered) with the driven path and where it stopped; metres in `map`."""
     resolution, (rows, columns) = picture.resolution_m, picture.cell.shape
     left, bottom = picture.ix0 * resolution, picture.iy0 * resolution
     extent = (left, left + columns * resolution, bottom, bottom + rows * resolution)
@@ -58,6 +58,8 @@ def map_picture(path: Path, picture: WorldPicture, driven: Series, title: str) -
     if driven:
         line = np.asarray(driven)
         axes.plot(line[:, 0], line[:, 1], color="#c2410c", linewidth=1.2)
+        if stops:
+            axes.plot(*np.asarray(stops).T, ".", color="#1d4ed8", markersize=4, label="viewpoint seen from")
         axes.plot(*line[0], marker="o", color="#0f766e", markersize=7, label="start")
         axes.plot(*line[-1], marker="s", color="#7c2d12", markersize=7, label="end")
         axes.legend(loc="best")

@@ -35,6 +35,11 @@ RECORDED: tuple[Topic[Any], ...] = (
 )  # fmt: skip
 """What a recorder must be given."""
 
+TRAJECTORY_COLUMNS = (
+    "t_s", "true_x_m", "true_y_m", "true_yaw_rad", "x_m", "y_m", "yaw_rad", "distance_m", "coverage",
+)  # fmt: skip
+"""Of trajectory.csv: true and estimated pose, driven distance and the judge's coverage over mission time."""
+
 _PACKAGES = ("plgrim", "eclipse-zenoh", "numpy", "numba", "pydantic", "scipy")
 
 
@@ -128,6 +133,7 @@ class MissionRecorder:
                 estimate.x_m,
                 estimate.y_m,
                 estimate.yaw_rad,
+                judge.distance_m,
                 judge.coverage,
             )
         )
@@ -254,9 +260,7 @@ class MissionRecorder:
             track, belief, picture = list(self._track), list(self._belief), self.picture
         with (out_dir / "trajectory.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(
-                ["t_s", "true_x_m", "true_y_m", "true_yaw_rad", "x_m", "y_m", "yaw_rad", "coverage"]
-            )
+            writer.writerow(TRAJECTORY_COLUMNS)
             writer.writerows([[f"{value:.4f}" for value in row] for row in track])
         coverage_plot(out_dir / "coverage.png", [(row[0], row[-1]) for row in track], belief)
         if picture is not None:

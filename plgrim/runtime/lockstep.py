@@ -16,7 +16,7 @@ from typing import Any
 import xxhash
 
 from plgrim.registry import STAGES, make_stage
-from plgrim.runtime.mailbox import Mailbox, Outbox
+from plgrim.runtime.mailbox import Mailbox, Outbox, SharedDecoder
 from schemas.base import Message
 from schemas.contract import Stage, StageSetup, StageSpec, Stamp, Topic
 from schemas.snapshot import pack_snapshot, unpack_snapshot
@@ -56,6 +56,7 @@ class Lockstep:
         self.now: Stamp = 0
         self._observer = observer
         self._digest = b""
+        self._decode = SharedDecoder()
         self._order = 0
         self._pending: list[tuple[Stamp, int, Topic[Message], bytes]] = []
         self._runners: dict[str, _Runner] = {}
@@ -90,9 +91,14 @@ class Lockstep:
     def _release(self) -> None:
         while self._pending and self._pending[0][0] <= self.now:
             _, _, topic, payload = heapq.heappop(self._pending)
-            self._digest = xxhash.xxh3_128_digest(self._digest + topic.name.encode() + payload)
+            hasher = xxhash.xxh3_128(self._digest + topic.name.encode())
+            hasher.update(payload)
+            self._digest = hasher.digest()
             for runner in self._readers[topic.name]:
-                if runner.mailbox.accept(topic, payload, self.now) and topic.name in runner.triggers:
+                if (
+                    runner.mailbox.accept(topic, payload, self.now, self._decode)
+                    and topic.name in runner.triggers
+                ):
                     runner.due_ns = self.now
 
     def _step(self, runner: _Runner) -> None:

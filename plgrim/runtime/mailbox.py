@@ -6,6 +6,7 @@ The live and the lock-step driver share this file, so that they accept and refus
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,23 @@ from schemas.contract import Inputs, Output, Received, Stamp, Topic
 from schemas.errors import MessageError, WrongSenderError
 
 _KEEP_ALL_LIMIT = 4096
+
+Decoder = Callable[[bytes, type[Message], int], tuple[Message, Envelope]]
+
+
+class SharedDecoder:
+    """As `decode`, but several readers of the same bytes get the same (frozen, read-only) message."""
+
+    def __init__(self) -> None:
+        self._payload: bytes | None = None
+        self._read: tuple[Message, Envelope] | None = None
+
+    def __call__(self, payload: bytes, expected: type[Message], max_bytes: int) -> tuple[Message, Envelope]:
+        """The message and its envelope. Raises what `decode` raises, for every reader."""
+        if self._read is None or payload is not self._payload:
+            self._read, self._payload = None, payload
+            self._read = decode(payload, expected, max_bytes)
+        return self._read
 
 
 @dataclass(slots=True)
@@ -38,10 +56,10 @@ class Mailbox:
     last_refusal: str = ""
     _held: dict[str, deque[_Held]] = field(default_factory=dict)
 
-    def accept(self, topic: Topic[Message], payload: bytes, received_ns: int) -> bool:
+    def accept(self, topic: Topic[Message], payload: bytes, received_ns: int, read: Decoder = decode) -> bool:
         """Decode, check the sender and keep the message; False, counted and remembered when it is refused."""
         try:
-            message, envelope = decode(payload, topic.message, topic.max_bytes)
+            message, envelope = read(payload, topic.message, topic.max_bytes)
             self._check_sender(topic, envelope)
         except MessageError as error:
             self.dropped[f"{topic.name}:{error.reason}"] += 1

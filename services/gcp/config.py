@@ -26,11 +26,16 @@ class Config(BaseModel):
         16.0, ge=0, le=1000, description="better by this much too, nats: more keeps the target longer."
     )
     crumb_share: float = Field(
-        0.1, ge=0, le=1, description="Of a target that promises less than this share of what it once did,"
+        0.1, ge=0, le=1, description="A target that promises less than this share of what it once did,"
     )
-    crumb_margin: float = Field(
-        2.0, ge=0, le=1000, description="twice as far as the best: that must be better by this, nats."
+    crumb_gain: float = Field(
+        1.0,
+        ge=0,
+        le=1000,
+        description="or less than this, nats, is a crumb. It gives way to what is better by",
     )
+    crumb_margin: float = Field(2.0, ge=0, le=1000, description="this, nats, and less than half as far")
+    crumb_times: float = Field(8.0, ge=1, le=1e6, description="or promises so many times as much.")
     same_target_m: float = Field(
         2.0, gt=0, le=20, description="A frontier so near to the target's place is the same target, m."
     )

@@ -174,10 +174,11 @@ class GcpStage:
         return _Choice(best, f"{says}; {why}", gap_m > self.config.same_target_m, shown)
 
     def _margin(self, kept: Option, best: Option) -> float:
-        """How much better the best must be. A crumb that is left of the target far away is no reason to pass others."""
-        crumb = kept.gain < self.config.crumb_share * self._target.gain
-        if crumb and kept.distance_m > 2.0 * best.distance_m:
-            return self.config.crumb_margin
+        """How much better the best must be. For a crumb, whole ground is not left unseen, nor what lies before it."""
+        c = self.config
+        crumb = kept.gain < max(c.crumb_share * self._target.gain, c.crumb_gain)
+        if crumb and (kept.distance_m > 2.0 * best.distance_m or best.gain >= c.crumb_times * kept.gain):
+            return c.crumb_margin
         return max(self.config.switch_margin, self.config.switch_margin_relative * abs(kept.q))
 
     def _remember(self, choice: _Choice) -> None:

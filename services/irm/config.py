@@ -31,6 +31,9 @@ class Config(BaseModel):
     # coverage sensor, as the planners assume it
     sensor_range_m: float = Field(6.0, gt=0, le=100, description="Range of the coverage sensor, m.")
     sensor_fov_deg: float = Field(120.0, gt=0, le=360, description="Field of view of the coverage sensor.")
+    sensor_height_m: float = Field(
+        0.8, gt=0, le=5, description="Of the coverage sensor over the ground, on rough ground, m."
+    )
     covered_probability: float = Field(
         0.9, gt=0.5, lt=1, description="From this probability a cell is covered."
     )

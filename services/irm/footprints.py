@@ -18,10 +18,12 @@ from planning.coverage import look_log_odds
 from planning.frames import Planar
 from planning.grid import FREE, GridSpec, overlap
 from planning.rays import visible_cells
+from planning.sight import visible_over
 from schemas.sensing import CoverageScan
 from services.irm.keyframes import IDENTITY, has_moved
 from services.irm.resample import moved
 from services.irm.tiles import TileLayer
+from services.irm.window import Relief
 
 BLUR_LEVELS = 5
 """Steps of the blur, by a factor of the square root of 2 each."""
@@ -68,12 +70,14 @@ class FootprintStore:
         state: NDArray[np.uint8],
         spec: GridSpec,
         odom_to_map: Planar,
+        relief: Relief | None = None,
     ) -> int:
         """Add one look. state: (h, w) risk map states over `spec` in odom. Returns how many cells were new.
 
-        Only known free cells are covered; unknown cells block the view like obstacles.
+        Only known free cells are covered. relief: heights, over which the sensor looks; on flat ground (None) unknown
+        cells block the view like obstacles.
         """
-        patch, seen = _look(scan, state, spec)
+        patch, seen = _look(scan, state, spec, relief)
         if patch is None:
             return 0
         held = self._footprints.get(scan.keyframe_id)
@@ -207,7 +211,7 @@ def blur_level(deviation_m: float, from_m: float) -> int:
 
 
 def _look(
-    scan: CoverageScan, state: NDArray[np.uint8], spec: GridSpec
+    scan: CoverageScan, state: NDArray[np.uint8], spec: GridSpec, relief: Relief | None = None
 ) -> tuple[GridSpec | None, NDArray[np.bool_]]:
     """The cells that one look sees, in odom, on a patch just large enough."""
     pose, resolution = scan.pose_in_odom, spec.resolution_m
@@ -219,8 +223,16 @@ def _look(
         return None, np.zeros((0, 0), dtype=np.bool_)
     piece = state[r0:r1, c0:c1]
     patch = GridSpec(resolution, spec.ix0 + c0, spec.iy0 + r0, c1 - c0, r1 - r0)
-    out = np.zeros(patch.shape, dtype=np.uint8)
     x_cells = pose.x_m / resolution - patch.ix0
     y_cells = pose.y_m / resolution - patch.iy0
-    visible_cells(piece != FREE, x_cells, y_cells, scan.range_m / resolution, pose.yaw_rad, scan.fov_rad, out)
-    return patch, (out != 0) & (piece == FREE)
+    reach_cells, free = scan.range_m / resolution, piece == FREE
+    if relief is not None:
+        over = np.zeros(patch.shape, dtype=np.bool_)
+        visible_over(
+            relief.top_m[r0:r1, c0:c1], relief.ground_m[r0:r1, c0:c1], free, (x_cells, y_cells, pose.z_m), reach_cells,
+            pose.yaw_rad, scan.fov_rad, over,
+        )  # fmt: skip
+        return patch, over
+    out = np.zeros(patch.shape, dtype=np.uint8)
+    visible_cells(piece != FREE, x_cells, y_cells, reach_cells, pose.yaw_rad, scan.fov_rad, out)
+    return patch, (out != 0) & free

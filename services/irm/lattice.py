@@ -213,9 +213,17 @@ def _connect(
         start_r = math.floor(anchor_m[node, 1] / resolution_m) - iy0
         reach = math.ceil(2.2 * spacing_m / resolution_m)
         box = (start_r - reach, start_r + reach + 1, start_c - reach, start_c + reach + 1)
+        ends = np.empty((4, 2), np.int32)
+        awaited = 0
+        for k in range(4):
+            if pending[k] == 1:
+                other = (row + _DY[k]) * size + column + _DX[k]
+                ends[awaited, 0] = math.floor(anchor_m[other, 1] / resolution_m) - iy0
+                ends[awaited, 1] = math.floor(anchor_m[other, 0] / resolution_m) - ix0
+                awaited += 1
         dijkstra_box(
-            step_cost, free_space, resolution_m, start_r, start_c, box, np.empty((0, 2), np.int32),
-            6.0 * spacing_m, cost, parent,
+            step_cost, free_space, resolution_m, start_r, start_c, box, ends[:awaited], 6.0 * spacing_m, cost,
+            parent,
         )  # fmt: skip
         for k in range(4):
             if pending[k] == 0:
@@ -332,3 +340,26 @@ def halve(
                     total += mass[r, c]
             out_opaque[row, column] = blocked >= 2
             out_mass[row, column] = total
+
+
+@njit
+def halve_heights(
+    ground_m: NDArray[np.float32],
+    top_m: NDArray[np.float32],
+    out_ground_m: NDArray[np.float32],
+    out_top_m: NDArray[np.float32],
+) -> None:
+    """Heights at half the resolution: the mean of the ground, and of the tops the second highest of four."""
+    for row in range(out_ground_m.shape[0]):
+        for column in range(out_ground_m.shape[1]):
+            total = np.float32(0.0)
+            first, second = np.float32(-np.inf), np.float32(-np.inf)
+            for r in range(2 * row, 2 * row + 2):
+                for c in range(2 * column, 2 * column + 2):
+                    total += ground_m[r, c]
+                    if top_m[r, c] > first:
+                        first, second = top_m[r, c], first
+                    elif top_m[r, c] > second:
+                        second = top_m[r, c]
+            out_ground_m[row, column] = np.float32(0.25) * total
+            out_top_m[row, column] = second

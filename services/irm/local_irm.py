@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 from planning.grid import UNKNOWN
 from planning.kernels import njit
 from planning.rays import visible_mass
+from planning.sight import visible_mass_over
 from schemas.base import Pose
 from schemas.world import LocalIrm
 from services.irm.config import Config
-from services.irm.lattice import choose_anchors, connect_neighbours, halve, sum_patches
+from services.irm.lattice import choose_anchors, connect_neighbours, halve, halve_heights, sum_patches
 from services.irm.window import Window
 
 _SEEN_SHARE = 0.5
 _MAX_BENT = 4096
 _MAX_BENT_POINTS = 1 << 17
+_NO_HEIGHTS = np.zeros((0, 0), np.float32)
 
 
 @dataclass(slots=True)
@@ -142,6 +144,10 @@ class LocalIrmBuilder:
         opaque, mass = np.zeros(half, np.bool_), np.zeros(half, np.float32)
         part = (slice(skip_y, None), slice(skip_x, None))
         halve(window.state[part] != 1, window.entropy[part] * window.uncovered[part], opaque, mass)
+        ground, top = _NO_HEIGHTS, _NO_HEIGHTS
+        if window.top_m is not None:
+            ground, top = np.zeros(half, np.float32), np.zeros(half, np.float32)
+            halve_heights(window.elevation_m[part], window.top_m[part], ground, top)
         rows = np.zeros((c.size * c.size, 2 * reach + 1), np.uint32)
         res = 2.0 * s.resolution_m
         column = np.floor(((ix + 2 * np.arange(half[1]) + 1.0) * s.resolution_m) / c.spacing_m) - ix0
@@ -150,8 +156,8 @@ class LocalIrmBuilder:
         outside = ((row < 0) | (row >= c.size))[:, None] | ((column < 0) | (column >= c.size))[None, :]
         patch[outside] = -1
         visible_rows(
-            opaque, mass, patch.astype(np.int32), ix * s.resolution_m, iy * s.resolution_m, res,
-            c.sensor_range_m, c.size, reach, state, anchor, entropy > 0.0, rows,
+            opaque, ground, top, mass, patch.astype(np.int32), ix * s.resolution_m, iy * s.resolution_m, res,
+            c.sensor_range_m, c.sensor_height_m, c.size, reach, state, anchor, entropy > 0.0, rows,
         )  # fmt: skip
         return rows
 
@@ -159,12 +165,15 @@ class LocalIrmBuilder:
 @njit
 def visible_rows(
     opaque: NDArray[np.bool_],
+    ground_m: NDArray[np.float32],
+    top_m: NDArray[np.float32],
     mass: NDArray[np.float32],
     patch_of: NDArray[np.int32],
     x0_m: float,
     y0_m: float,
     resolution_m: float,
     range_m: float,
+    height_m: float,
     size: int,
     reach: int,
     state: NDArray[np.uint8],
@@ -172,7 +181,11 @@ def visible_rows(
     wanted: NDArray[np.bool_],
     rows: NDArray[np.uint32],
 ) -> None:
-    """Set the bits of the nodes that each traversable node sees: at least half of their uncovered mass in sight."""
+    """Set the bits of the nodes that each traversable node sees: at least half of their uncovered mass in sight.
+
+    ground_m, top_m: heights, over which a sensor height_m above the anchor's ground looks; (0, 0) on flat ground.
+    """
+    rough = top_m.size > 0
     whole = np.zeros(size * size, np.float32)
     for row in range(opaque.shape[0]):
         for column in range(opaque.shape[1]):
@@ -193,7 +206,11 @@ def visible_rows(
         # Anchors are centres of cells, quarters of these: exact, since rays that graze a corner hang on the last bit.
         x = round(4.0 * (anchor_m[node, 0] - x0_m) / resolution_m) / 4.0
         y = round(4.0 * (anchor_m[node, 1] - y0_m) / resolution_m) / 4.0
-        visible_mass(opaque, mass, x, y, range_m / resolution_m, patch_of, seen)
+        if rough:
+            z_m = ground_m[min(int(y), ground_m.shape[0] - 1), min(int(x), ground_m.shape[1] - 1)] + height_m
+            visible_mass_over(top_m, ground_m, mass, (x, y, z_m), range_m / resolution_m, patch_of, seen)
+        else:
+            visible_mass(opaque, mass, x, y, range_m / resolution_m, patch_of, seen)
         for r in range(max(0, own_row - reach), min(size, own_row + reach + 1)):
             for c in range(max(0, own_column - reach), min(size, own_column + reach + 1)):
                 other = r * size + c

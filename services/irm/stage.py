@@ -42,7 +42,7 @@ from services.irm.local_irm import LocalIrmBuilder
 from services.irm.resample import moved
 from services.irm.roadmap import Roadmap
 from services.irm.tiles import TileLayer
-from services.irm.window import Window, build_window, grid_of, read_layer, window_picture
+from services.irm.window import Window, build_window, grid_of, read_layer, relief_of, window_picture
 
 __all__ = ["Config", "IrmStage", "create", "spec"]
 
@@ -175,7 +175,8 @@ class IrmStage:
             if keyframe is None:
                 waiting.append(scan)
                 continue
-            self._store.add(scan, keyframe, risk.state, grid_of(risk), self._frame_of(scan, keyframe))
+            seen_by = self._frame_of(scan, keyframe)
+            self._store.add(scan, keyframe, risk.state, grid_of(risk), seen_by, relief_of(risk))
         self._pending = waiting
 
     def _frame_of(self, scan: CoverageScan, keyframe: Planar) -> Planar:

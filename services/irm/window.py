@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,13 @@ KNOWN, GROUND = 2, 1
 """Of the ground layer: seen but out of the robot's reach or an obstacle; ground that it can touch. 0: never seen."""
 
 
+class Relief(NamedTuple):
+    """Heights of the ground and of what a sensor has to look over, (h, w) each, m in `odom`."""
+
+    ground_m: NDArray[np.float32]
+    top_m: NDArray[np.float32]
+
+
 @dataclass(slots=True)
 class Window:
     """What is known around the robot, all (h, w) over `spec` in `odom`, in which nothing jumps.
@@ -34,6 +41,7 @@ class Window:
     far as obstacles are known. free_space: its centre fits, and gets there over known ground; reachable: or over
     forgotten ground. ground: what its body can touch from there. uncovered: ground below the covered
     probability, slivers of one cell left out. entropy: of uncovered cells, nats of whole patches (0 elsewhere).
+    top_m: what the coverage sensor has to look over; None: whatever is not free blocks the sight.
     hazard: CVaR of the hazard rate, its mean under the body, 1/m. step_cost: cost per metre of the grid search.
     """
 
@@ -51,6 +59,7 @@ class Window:
     entropy: NDArray[np.float32]
     robot_cell: tuple[int, int]
     elevation_m: NDArray[np.float32]
+    top_m: NDArray[np.float32] | None = None
     frame: Planar = IDENTITY
     frame_z_m: float = 0.0
     _from_map: Planar = field(init=False)
@@ -80,6 +89,17 @@ def grid_of(risk: RiskMap) -> GridSpec:
     """Where a risk map lies, in `odom`."""
     g = risk.grid
     return GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
+
+
+def tops_of(risk: RiskMap) -> NDArray[np.float32] | None:
+    """What the coverage sensor has to look over, (h, w) m; None on flat ground."""
+    return risk.top_m if risk.top_m.shape == risk.state.shape else None
+
+
+def relief_of(risk: RiskMap) -> Relief | None:
+    """The heights of a risk map; None on flat ground."""
+    top_m = tops_of(risk)
+    return None if top_m is None else Relief(risk.elevation_m, top_m)
 
 
 def read_layer(layer: TileLayer, spec: GridSpec, frame: Planar) -> NDArray[Any]:
@@ -152,6 +172,7 @@ def build_window(
         entropy=cell_entropy,
         robot_cell=robot,
         elevation_m=risk.elevation_m,
+        top_m=tops_of(risk),
         frame=frame,
         frame_z_m=frame_z_m,
     )

@@ -31,6 +31,15 @@ class Config(BaseModel):
     settle_s: float = Field(
         4.0, ge=0, le=600, description="Covered when there was nothing left to go to for so long, s."
     )
+    worth_m_per_nat: float = Field(
+        150.0,
+        ge=0,
+        le=1e6,
+        description="What is farther away than this for each nat it promises is not worth the way, m. 0: all is,",
+    )
+    worth_share: float = Field(
+        0.005, ge=0, le=1, description="as long as all such places are no more than this share of the ground."
+    )
     no_progress_s: float = Field(
         600.0, gt=0, description="Give up when exploring so long without progress, s; pauses do not count."
     )

@@ -23,8 +23,8 @@ class Facts:
 
     now_ns: mission clock. localised: odometry has come. distance_m: driven since the first odometry.
     return_distance_m: travel home by the graph. home_distance_m: straight line home. settled: nothing left to
-    go to (None: not known now). covered_area_m2: by the belief (None: not known now). left: places left
-    uncovered. commands: (id, kind), oldest first.
+    go to that is worth the way (None: not known now). covered_area_m2: by the belief (None: not known now). left:
+    places left uncovered. commands: (id, kind), oldest first.
     """
 
     now_ns: int
@@ -178,7 +178,7 @@ class Machine:
         if facts.now_ns - self.settled_since_ns >= self.config.settle_s * SECOND_NS:
             reason = "all ground that could be reached is covered"
             if facts.left:
-                reason += f"; {facts.left} places could not be reached"
+                reason += f"; {facts.left} places could not be reached, or are not worth the way"
             self._end_or_go_home(FinishReason.COVERED, reason, self.config.return_when_done, facts)
 
     def _check_time(self, facts: Facts) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from planning.coverage import LOG_2
 from planning.frames import Planar
 from planning.graph_mirror import FRONTIER, GraphMirror, RoadMap
 from schemas.base import Pose
@@ -22,6 +24,22 @@ from services.mission.machine import Facts, Machine
 __all__ = ["Config", "MissionStage", "create", "spec", "warm_up"]
 
 _MAX_JUMP_M = 2.0  # between two steps; more is an odometry fault, not travel
+
+
+class _Ways(NamedTuple):
+    """Travel over one version of the graph from the robot's node: home, m; and what is left to go to.
+
+    near: whether some frontier is worth its way. promised: what all frontiers promise, nats.
+    """
+
+    version: int
+    node: int
+    home_m: float
+    near: bool
+    promised: float
+
+
+_NO_WAYS = _Ways(-1, -1, 0.0, True, 0.0)
 
 
 def spec(config: Config) -> StageSpec:
@@ -48,7 +66,7 @@ class MissionStage:
         self._coverage = 0.0
         self._asked_ns = -1
         self._unreachable: list[LeftOver] = []
-        self._way: tuple[int, int, float] = (-1, -1, 0.0)  # graph version, robot node, travel from there home
+        self._ways = _NO_WAYS
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One step: the mission's state, and a request for the graph when a difference was missed."""
@@ -98,7 +116,7 @@ class MissionStage:
             distance_m=self._distance_m,
             return_distance_m=return_m,
             home_distance_m=self._home_distance_m(),
-            settled=None if coverage is None else coverage.settled,
+            settled=None if coverage is None else self._settled(coverage),
             covered_area_m2=None if coverage is None else coverage.covered_area_m2,
             left=left,
             commands=commands,
@@ -116,25 +134,47 @@ class MissionStage:
         if self._home is None or self._at is None:
             return 0.0
         straight = self._home_distance_m()
-        key = (self._mirror.version, self._mirror.robot_node)
-        if self._way[:2] != key:
-            self._way = (*key, self._graph_travel_m(self._mirror.road_map()))
+        ways = self._ways_now()
         robot = self._mirror.road_map().index_of(self._mirror.robot_node)
-        if robot < 0 or not math.isfinite(self._way[2]):
+        if robot < 0 or not math.isfinite(ways.home_m):
             return max(straight, self._distance_m)
         to_node = math.dist(self._mirror.road_map().xyz_m[robot, :2], _xy(self._at))
-        return max(straight, to_node + self._way[2])
+        return max(straight, to_node + ways.home_m)
 
-    def _graph_travel_m(self, road_map: RoadMap) -> float:
+    def _ways_now(self) -> _Ways:
+        """The ways over the graph as it is, computed once a version."""
+        version, node = self._mirror.version, self._mirror.robot_node
+        if (self._ways.version, self._ways.node) == (version, node):
+            return self._ways
+        road_map = self._mirror.road_map()
+        robot, frontiers = road_map.index_of(node), np.flatnonzero(road_map.kind == FRONTIER)
+        promised = float(road_map.gain[frontiers].sum())
+        home_m, near = math.inf, True
+        if robot >= 0:
+            travel, _ = road_map.travel_from(robot)
+            home_m = self._graph_travel_m(road_map, travel)
+            worth_m = self.config.worth_m_per_nat * road_map.gain[frontiers]
+            reached = np.isfinite(travel[frontiers])
+            near = not reached.any() or bool((travel[frontiers] <= worth_m)[reached].any())
+        self._ways = _Ways(version, node, home_m, near or self.config.worth_m_per_nat == 0.0, promised)
+        return self._ways
+
+    def _graph_travel_m(self, road_map: RoadMap, travel: NDArray[np.float64]) -> float:
         """From the robot's breadcrumb over the graph to the one nearest to home, and from there home."""
-        robot = road_map.index_of(self._mirror.robot_node)
-        if robot < 0 or self._home is None:
+        if self._home is None:
             return math.inf
         end = road_map.nearest_breadcrumb((self._home.x_m, self._home.y_m, self._home.z_m))
         if end < 0:
             return math.inf
-        travel, _ = road_map.travel_from(robot)
         return float(travel[end]) + math.dist(road_map.xyz_m[end, :2], _xy(self._home))
+
+    def _settled(self, coverage: CoverageSummary) -> bool:
+        """Nothing is left to go to, or only little that is far away for what it promises."""
+        if coverage.settled:
+            return True
+        ways = self._ways_now()
+        little = ways.promised <= self.config.worth_share * LOG_2 * coverage.covered_area_m2
+        return not ways.near and little
 
     def _left(self) -> list[LeftOver]:
         """What is not covered and why: unreachable frontiers, and those still to be visited; best first."""
@@ -205,7 +245,7 @@ class MissionStage:
         self._distance_m, self._coverage = state["distance_m"], state["coverage"]
         self._asked_ns = state["asked_ns"]
         self._unreachable = [LeftOver(**place) for place in state["unreachable"]]
-        self._way = (-1, -1, 0.0)
+        self._ways = _NO_WAYS
 
 
 def _in_map(odometry: Odometry) -> Pose:

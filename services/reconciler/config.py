@@ -63,3 +63,6 @@ class Config(BaseModel):
     blocked_s: float = Field(
         1.0, gt=0, le=60, description="Blocked or stuck so long, the path is dropped, s."
     )
+    back_off_m: float = Field(
+        0.4, ge=0, le=2, description="Blocked, the robot drives back so far on the way that it came, m."
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 
 import numpy as np
@@ -42,17 +43,21 @@ from services.reconciler.path import (
 )
 from services.reconciler.safety import SafetyInputs, SafetyLimits, Verdict, judge
 from services.reconciler.tau import choose_tau, tau_terms
+from services.reconciler.trail import Trail
 
 __all__ = ["Config", "ReconcilerStage", "create", "spec"]
 
 _NO_POINTS = np.zeros((0, 2))
 _KEPT = (
     "at", "end", "episode", "opened_ns", "asked_ns", "plan_id", "published_ns", "changed", "slow", "why", "tau_s",
-    "kept_end", "trouble_ns", "value_ratio", "latency_s",
+    "kept_end", "trouble_ns", "value_ratio", "latency_s", "backing_ns",
 )  # fmt: skip
 """What a snapshot holds as it is."""
 _SKIPPED_IDS = 10_000
 """More than the plans and episodes of the longest time between two snapshots."""
+_TRAIL_M = 2.0
+_BACKING_S = 5.0
+"""Backing off ends then at the latest."""
 _SOON_M = 2.5
 """With less of the path left than this a new episode opens at once."""
 
@@ -93,6 +98,8 @@ class ReconcilerStage:
         self._value_ratio = 1.0
         self._latency_s = 0.0
         self._plan: Plan | None = None
+        self._trail = Trail(_TRAIL_M)
+        self._backing_ns = -1
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One cycle: safety first, then the path, then episodes."""
@@ -113,7 +120,7 @@ class ReconcilerStage:
         self._follow(now, odometry.message, follower)
         for received in inputs.new(LOCAL_POLICY):
             self._install(now, received.message, odometry.message, ground)
-        if risk.fresh or self._changed:
+        if (risk.fresh or self._changed) and self._backing_ns < 0:
             self._check_hazards(ground, odometry.message)
         irm = inputs.current(LOCAL_IRM)
         if verdict.may_move and irm is not None and self._wants_episode(now):
@@ -158,6 +165,7 @@ class ReconcilerStage:
 
     def _follow(self, now: Stamp, odometry: Odometry, follower: FollowerState | None) -> None:
         """Where the robot is on its path; drop the path when the robot has left it or cannot go on."""
+        self._trail.add(odometry.pose.x_m, odometry.pose.y_m)
         if self._committed is None:
             return
         points = self._committed.points
@@ -179,10 +187,27 @@ class ReconcilerStage:
             self._trouble_ns = now
         elif now - self._trouble_ns > self._config.blocked_s * SECOND_NS:
             self._trouble_ns = -1
+            backing = self._backing_ns >= 0
             self._drop("blocked")
+            if not backing:
+                self._back_off(now, odometry)
+        if self._backing_ns >= 0 and (
+            self._left_m() < STEP_M or now - self._backing_ns > _BACKING_S * SECOND_NS
+        ):
+            self._drop("backed off")
+
+    def _back_off(self, now: Stamp, odometry: Odometry) -> None:
+        """Drive back a little on the way that the robot came, facing what is in its way."""
+        x, y = odometry.pose.x_m, odometry.pose.y_m
+        line = resample(self._trail.back(x, y, self._config.back_off_m))
+        if len(line) > 1:
+            nothing = np.zeros((0, 2), np.int64)
+            self._committed = Committed(line, nothing, np.zeros(0, np.int64))
+            self._end, self._backing_ns, self._why = len(line) - 1, now, "blocked: backs off"
 
     def _drop(self, why: str) -> None:
         self._committed, self._opened = None, None
+        self._backing_ns = -1
         self._at = self._end = 0
         self._changed, self._why = True, why
 
@@ -193,6 +218,8 @@ class ReconcilerStage:
 
     def _wants_episode(self, now: Stamp) -> bool:
         c = self._config
+        if self._backing_ns >= 0:
+            return False
         if self._opened is not None:
             if now - self._opened.opened_ns < c.episode_timeout_s * SECOND_NS:
                 return False
@@ -403,7 +430,11 @@ class ReconcilerStage:
         points, first = _NO_POINTS, max(self._at - 1, 0)
         if moving and self._committed is not None:
             points = self._committed.points[first : self._end + 1]
-        speed, time_s = speeds(points, odometry.speed_mps, ground, self._config, share)
+        speed, time_s = speeds(points, abs(odometry.speed_mps), ground, self._config, share)
+        yaw = headings(points)
+        if self._backing_ns >= 0:
+            speed = np.minimum(speed, self._config.min_speed_mps)
+            yaw = np.remainder(yaw + 2.0 * math.pi, 2.0 * math.pi) - math.pi
         return Plan(
             stamp_ns=now,
             plan_id=max(self._plan_id, 1),
@@ -417,7 +448,7 @@ class ReconcilerStage:
             risk_stamp_ns=risk_stamp_ns,
             x_m=np.ascontiguousarray(points[:, 0]),
             y_m=np.ascontiguousarray(points[:, 1]),
-            yaw_rad=headings(points),
+            yaw_rad=yaw,
             speed_mps=speed,
             time_s=time_s,
         )
@@ -430,6 +461,7 @@ class ReconcilerStage:
                 "committed": None if self._committed is None else asdict(self._committed),
                 "opened": None if self._opened is None else pack_opened(self._opened),
                 "plan": None if self._plan is None else pack_message(self._plan),
+                "trail": self._trail.state(),
             }
         )
 
@@ -441,6 +473,7 @@ class ReconcilerStage:
         self._committed = None if state["committed"] is None else Committed(**state["committed"])
         self._opened = None if state["opened"] is None else unpack_opened(state["opened"])
         self._plan = None if state["plan"] is None else unpack_message(state["plan"], Plan)
+        self._trail.load(state["trail"])
 
     def resumed(self) -> None:
         """The robot plans anew from where it stands. Ids that were given since the snapshot are not given again: the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ class RiskLayers(NamedTuple):
     clearance_m: NDArray[np.float32]
 
 
+@cache
 def cvar_factor(alpha: float) -> float:
     """CVaR_alpha of a normal variable is mean + factor * deviation: pdf(quantile(alpha)) / (1 - alpha)."""
     return float(norm.pdf(norm.ppf(alpha)) / (1.0 - alpha))

@@ -125,6 +125,9 @@ class Config(BaseModel):
     knee_height_m: float = Field(
         0.4, gt=0, le=2, description="What a risk-blind robot takes for an obstacle, m."
     )
+    bump_memory_s: float = Field(
+        90.0, ge=0, le=3600, description="Where something stopped the robot twice stays lethal so long, s."
+    )
     # when
     publish_period_s: float = Field(0.2, ge=0.05, le=5, description="Time between risk maps, s.")
     cloud_timeout_s: float = Field(1.0, gt=0, le=60, description="Older clouds are not used, s.")

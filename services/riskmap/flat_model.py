@@ -59,6 +59,10 @@ class FlatModel:
         )  # fmt: skip
         return layers, np.zeros(w.spec.shape, dtype=np.float32)
 
+    def tops(self, ground_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """None, (0, 0): heights are not known, and whatever stands blocks the sight."""
+        return np.zeros((0, 0), dtype=np.float32)
+
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
         w = self._window

@@ -9,7 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.kernels import njit
-from services.riskmap.cells import BELOW, CEILING_SEEN, HIT_WEIGHT, LOG_ODDS, MEAN, SEEN, TRAVELLED, VARIANCE
+from services.riskmap.cells import (
+    BELOW,
+    CEILING,
+    CEILING_SEEN,
+    HIT_WEIGHT,
+    LOG_ODDS,
+    MEAN,
+    SEEN,
+    TRAVELLED,
+    VARIANCE,
+)
 from services.riskmap.sweep import BEARINGS, Sweep
 
 NOTHING, GROUND, ABOVE, OVERHEAD = 0, 1, 2, 3
@@ -237,6 +247,10 @@ def _fuse(cell: NDArray[np.float32], z: float, noise: float, points: float, rule
             cell[CEILING_SEEN] = 0.0  # another storey
     cell[MEAN], cell[VARIANCE] = z, noise
     cell[SEEN], cell[TRAVELLED] = points, rules.travelled_m
+    # Ground that rises before the robot is taken for something overhead, while what leads there is unknown. What is
+    # truly as low will be hit again, as an obstacle over this ground.
+    if cell[CEILING_SEEN] > 0.0 and cell[CEILING] - z <= rules.height_m:
+        cell[CEILING_SEEN] = 0.0
     if cell[HIT_WEIGHT] == 0.0:
         cell[LOG_ODDS] = max(cell[LOG_ODDS] - rules.pass_log_odds, -rules.hit_log_odds)
 
@@ -270,6 +284,7 @@ def join_rings(
     bins = kind.shape[1]
     distance, height = np.empty(bins + 1, dtype=np.float64), np.empty(bins + 1, dtype=np.float64)
     clear = np.empty(bins + 1, dtype=np.bool_)
+    sensor = (sweep.sensor[0], sweep.sensor[1], sweep.sensor[2])
     for b in range(BEARINGS):
         if sweep.start[b] == sweep.start[b + 1]:
             continue
@@ -277,7 +292,10 @@ def join_rings(
         dx, dy = math.cos(angle), math.sin(angle)
         distance[0], height[0], clear[0] = 0.0, rules.feet_m, False
         count, obstructed = 1, False
+        left, right = (b - 1) % BEARINGS, (b + 1) % BEARINGS
         for k in range(bins):
+            if kind[b, k] + kind[left, k] + kind[right, k] == NOTHING:
+                continue
             seen = _seen_from(kind, b, k)
             if seen < 0:
                 continue
@@ -287,12 +305,12 @@ def join_rings(
                 count += 1
             elif not obstructed:  # the lowest ray to something upright passes over ground, too
                 near, near_z = distance[count - 1], height[count - 1]
-                _along_gap(sweep, dx, dy, near, near_z, r, sweep.low[seen, k], False, cells, rules)
+                _along_gap(sensor, dx, dy, near, near_z, r, sweep.low[seen, k], False, cells, rules)
             obstructed = kind[seen, k] == ABOVE
         for j in range(1, count):
             fill = j > 1 and clear[j] and _joinable(distance, height, clear, count, j, rules)
             _along_gap(
-                sweep, dx, dy, distance[j - 1], height[j - 1], distance[j], height[j], fill, cells, rules
+                sensor, dx, dy, distance[j - 1], height[j - 1], distance[j], height[j], fill, cells, rules
             )
 
 
@@ -340,7 +358,7 @@ def _joinable(
 
 @njit
 def _along_gap(
-    sweep: Sweep,
+    sensor: tuple[float, float, float],
     dx: float,
     dy: float,
     near: float,
@@ -352,31 +370,42 @@ def _along_gap(
     rules: GroundRules,
 ) -> None:
     """The cells strictly between two hits: suppose ground, and doubt ground that stands in the ray's way."""
-    pace = 0.7 * rules.resolution_m
-    fall = (far_z - sweep.sensor[2]) / far
+    # Not through `slot` and views of cells: this walk is most of what a sweep costs.
+    res, height, width = rules.resolution_m, cells.shape[0], cells.shape[1]
+    pace = 0.7 * res
+    x0, y0, z0 = sensor
+    fall = (far_z - z0) / far
+    bounds = fall < -_STEEP_LOOK and not fill
     for s in range(1, math.ceil((far - near) / pace)):
         r = near + s * pace
-        row, column = slot(rules, cells.shape[0], cells.shape[1], sweep.sensor[0] + r * dx, sweep.sensor[1] + r * dy)  # fmt: skip  # noqa: E501
-        if row < 0:
+        row = int(math.floor((y0 + r * dy) / res)) - rules.iy0
+        column = int(math.floor((x0 + r * dx) / res)) - rules.ix0
+        if row < 0 or row >= height or column < 0 or column >= width:
             return
-        cell = cells[row, column]
-        if far - r > rules.resolution_m:
-            below = sweep.sensor[2] + fall * r + _BOUND_TOLERANCE_M + 3.0 * rules.angle_sigma_rad * r
-            if cell[VARIANCE] > 0.0:
-                if cell[MEAN] > below:
-                    _doubt(cell)
-            elif fall < -_STEEP_LOOK and not fill and (cell[SEEN] != BELOW or below < cell[MEAN]):
-                cell[MEAN], cell[SEEN] = below, BELOW
+        row, column = row + rules.row0, column + rules.column0
+        row, column = (
+            (row - height if row >= height else row),
+            (column - width if column >= width else column),
+        )
+        if far - r > res:
+            known = cells[row, column, VARIANCE] > 0.0
+            if known or bounds:
+                below = z0 + fall * r + _BOUND_TOLERANCE_M + 3.0 * rules.angle_sigma_rad * r
+                if known:
+                    if cells[row, column, MEAN] > below:
+                        _doubt(cells, row, column)
+                elif cells[row, column, SEEN] != BELOW or below < cells[row, column, MEAN]:
+                    cells[row, column, MEAN], cells[row, column, SEEN] = below, BELOW
         if fill:
             share = (r - near) / (far - near)
             sigma = rules.fill_sigma_per_m * min(r - near, far - r) + rules.range_sigma_m
-            suppose(cell, near_z + share * (far_z - near_z), sigma * sigma, rules)
+            suppose(cells[row, column], near_z + share * (far_z - near_z), sigma * sigma, rules)
 
 
 @njit
-def _doubt(cell: NDArray[np.float32]) -> None:
+def _doubt(cells: NDArray[np.float32], row: int, column: int) -> None:
     """A ray passed below this cell's ground: it is forgotten at once if it was supposed, else after a few rays."""
-    cell[VARIANCE] += _CONTRADICTED_SIGMA_M * _CONTRADICTED_SIGMA_M
-    if cell[SEEN] == 0.0 or cell[VARIANCE] > _FORGOTTEN_VARIANCE:
-        cell[VARIANCE] = 0.0
-        cell[SEEN] = 0.0
+    cells[row, column, VARIANCE] += _CONTRADICTED_SIGMA_M * _CONTRADICTED_SIGMA_M
+    if cells[row, column, SEEN] == 0.0 or cells[row, column, VARIANCE] > _FORGOTTEN_VARIANCE:
+        cells[row, column, VARIANCE] = 0.0
+        cells[row, column, SEEN] = 0.0

@@ -101,9 +101,8 @@ def propagate(value: float, variance: float, limit: float, limits: Limits) -> tu
 
 
 @njit
-def _collision(log_odds: float, room_m: float, room_variance: float, limits: Limits) -> float:
-    """Probability of touching something in the cell, above that of the clearest possible cell."""
-    floor = 1.0 / (1.0 + math.exp(limits.clamp_log_odds))
+def _collision(log_odds: float, room_m: float, room_variance: float, floor: float, limits: Limits) -> float:
+    """Probability of touching something in the cell, above that of the clearest possible cell (`floor`)."""
     p = (1.0 / (1.0 + math.exp(-log_odds)) - floor) / (1.0 - floor) if log_odds > 0.0 else 0.0
     if room_m < np.inf:
         deviation = math.sqrt(2.0 * max(room_variance, 1e-6))
@@ -126,16 +125,32 @@ def _combine(
     variance: NDArray[np.float32],
 ) -> None:
     full = limits.full_hazard_per_m
+    floor = 1.0 / (1.0 + math.exp(limits.clamp_log_odds))
+    # Taken out of their tuples once: handed on in them, numba counts their references for every cell.
+    log_odds, rooms, room_variances = obstacles.log_odds, obstacles.room_m, obstacles.room_variance
+    fitted, slope, slope_variance = metrics.fitted, metrics.slope_rad, metrics.slope_variance
+    roughness, roughness_variance = metrics.roughness_m, metrics.roughness_variance
+    step, step_variance = metrics.step_m, metrics.step_variance
+    drop, drop_variance = metrics.drop_m, metrics.drop_variance
     rows, columns = state.shape
     for r in range(rows):
         for c in range(columns):
-            room, room_variance = obstacles.room_m[r, c], obstacles.room_variance[r, c]
-            p = _collision(obstacles.log_odds[r, c], room, room_variance, limits)
+            room = rooms[r, c]
+            p = _collision(log_odds[r, c], room, room_variances[r, c], floor, limits)
             h, v = full * p, full * full * p * (1.0 - p)
-            lethal = obstacles.log_odds[r, c] > 0.0 or room < limits.height_m
+            lethal = log_odds[r, c] > 0.0 or room < limits.height_m
             if limits.terrain and not lethal:
                 for k in range(4):
-                    value, doubt, limit = _metric(metrics, k, r, c, limits)
+                    if k == 0:
+                        value, doubt, limit = slope[r, c], slope_variance[r, c], limits.slope_rad
+                    elif k == 1:
+                        value, doubt, limit = roughness[r, c], roughness_variance[r, c], limits.roughness_m
+                    elif k == 2:
+                        value, doubt, limit = step[r, c], step_variance[r, c], limits.step_m
+                    else:
+                        value, doubt, limit = drop[r, c], drop_variance[r, c], limits.drop_m
+                    if value == 0.0 and doubt == 0.0:
+                        continue  # most cells have no step, no drop: these add nothing
                     one, one_variance = propagate(value, doubt, limit, limits)
                     h += one
                     v += one_variance
@@ -144,20 +159,8 @@ def _combine(
                     h, v = full, 0.0
             if lethal:
                 state[r, c] = LETHAL
-            elif metrics.fitted[r, c]:
+            elif fitted[r, c]:
                 state[r, c] = FREE
             else:
                 h, v = 0.5 * full, 0.25 * full * full
             mean[r, c], variance[r, c] = min(h, full), v
-
-
-@njit
-def _metric(metrics: TerrainMetrics, k: int, r: int, c: int, limits: Limits) -> tuple[float, float, float]:
-    """(value, variance, limit) of the k-th source of hazard in a cell."""
-    if k == 0:
-        return metrics.slope_rad[r, c], metrics.slope_variance[r, c], limits.slope_rad
-    if k == 1:
-        return metrics.roughness_m[r, c], metrics.roughness_variance[r, c], limits.roughness_m
-    if k == 2:
-        return metrics.step_m[r, c], metrics.step_variance[r, c], limits.step_m
-    return metrics.drop_m[r, c], metrics.drop_variance[r, c], limits.drop_m

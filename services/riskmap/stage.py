@@ -12,8 +12,9 @@ from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.sensing import Odometry, PointCloud, ReadyGrid
 from schemas.snapshot import pack_snapshot, unpack_snapshot
-from schemas.topics import CLOUD, ODOMETRY, READY_GRID, RISK_MAP
+from schemas.topics import CLOUD, FOLLOWER, ODOMETRY, READY_GRID, RISK_MAP
 from schemas.world import GridHeader, RiskMap
+from services.riskmap.bumps import Bumps, stamp_bumps
 from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
 from services.riskmap.flat_model import FlatModel
@@ -59,6 +60,10 @@ class Model(Protocol):
         """The risk layers and the ground's height."""
         ...
 
+    def tops(self, ground_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Height of the ground or of what stands on it, (h, w); (0, 0) where heights are not known."""
+        ...
+
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
         ...
@@ -82,6 +87,7 @@ class RiskMapStage:
         self._news = False
         self._pose = Pose()
         self._grid: ReadyGrid | None = None
+        self._bumps = Bumps(config.footprint_radius_m, int(config.bump_memory_s * SECOND_NS))
         self.bad_points = 0
         self.future_messages = 0
 
@@ -93,6 +99,9 @@ class RiskMapStage:
         odometry = inputs.latest(ODOMETRY)
         if odometry is not None:
             self._pose = odometry.message.pose
+            follower = inputs.current(FOLLOWER)
+            blocked = follower is not None and follower.blocked
+            self._bumps.observe(now, self._pose, odometry.message.speed_mps, blocked)
         self._drop_old_grid(now)
         for received in inputs.new(CLOUD):
             if received.age_ns <= self._config.cloud_timeout_s * SECOND_NS and self._timely(
@@ -111,7 +120,7 @@ class RiskMapStage:
             self._roll_to(self._pose)
             stamp_ns = max(stamp_ns, _stamp(odometry.message if odometry is not None else None, now))
         self._published_ns, self._news = now, False
-        return [Output(RISK_MAP, self._risk_map(stamp_ns))]
+        return [Output(RISK_MAP, self._risk_map(now, stamp_ns))]
 
     def _timely(self, now: Stamp, message: PointCloud | ReadyGrid) -> bool:
         """Whether a message may be from now; counts it otherwise."""
@@ -145,9 +154,10 @@ class RiskMapStage:
         self._stamp_ns = cloud.stamp_ns
         return True
 
-    def _risk_map(self, stamp_ns: int) -> RiskMap:
+    def _risk_map(self, now: Stamp, stamp_ns: int) -> RiskMap:
         layers, elevation_m = self._model.layers(self._pose)
         s = self._model.spec
+        stamp_bumps(layers, s, self._bumps.places(now), self._config.collision_hazard_per_m)
         return RiskMap(
             stamp_ns=stamp_ns,
             grid=GridHeader(
@@ -156,6 +166,7 @@ class RiskMapStage:
             robot_pose=self._pose,
             footprint_radius_m=self._config.footprint_radius_m,
             elevation_m=elevation_m,
+            top_m=self._model.tops(elevation_m),
             **layers._asdict(),
         )
 
@@ -168,6 +179,7 @@ class RiskMapStage:
                 "news": self._news,
                 "pose": self._pose.model_dump(),
                 "grid": None if self._grid is None else self._grid.model_dump(),
+                "bumps": self._bumps.state(),
             }
         )
 
@@ -179,6 +191,7 @@ class RiskMapStage:
         self._news = bool(state["news"])
         self._pose = Pose(**state["pose"])
         self._grid = None if state["grid"] is None else ReadyGrid(**state["grid"])
+        self._bumps.load(state["bumps"])
 
 
 def _stamp(odometry: Odometry | None, now: Stamp) -> Stamp:
@@ -197,4 +210,4 @@ def warm_up() -> None:
     for model in (FlatModel(Config(window_m=6.0)), TerrainModel(Config(model="terrain", window_m=6.0))):
         model.integrate(cloud)
         model.apply_grid(grid, Pose(), only_new=True)
-        model.layers(Pose())
+        model.tops(model.layers(Pose())[1])

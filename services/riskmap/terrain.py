@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
+from services.riskmap.steps import find_steps
 
 _WEIGHT_VARIANCE = 0.02**2
 """Heights as certain as this weigh half in the fit of a plane, m2."""
@@ -85,7 +86,7 @@ def terrain_metrics(
         layers[:4],
     )
     reach = max(1, int(step_reach_m / resolution_m + 1e-6))
-    _find_steps(
+    find_steps(
         ground.height_m,
         ground.single,
         ground.drift_m,
@@ -132,34 +133,31 @@ def _fit_planes(
     rows, columns = height_m.shape
     reach = spans.shape[0] // 2
     full = float((2 * spans + 1).sum())
-    # Sums over the columns to the left of: number, w, w x, w xx, w z, w xz, w zz, w variance.
-    sums = np.zeros((rows, columns + 1, 8))
-    for r in range(rows):
-        for c in range(columns):
-            for q in range(8):
-                sums[r, c + 1, q] = sums[r, c, q]
-            if known[r, c]:
-                w = _WEIGHT_VARIANCE / (variance[r, c] + _WEIGHT_VARIANCE)
-                x, z = c * resolution_m, float(height_m[r, c])
-                sums[r, c + 1, 0] += 1.0
-                sums[r, c + 1, 1] += w
-                sums[r, c + 1, 2] += w * x
-                sums[r, c + 1, 3] += w * x * x
-                sums[r, c + 1, 4] += w * z
-                sums[r, c + 1, 5] += w * x * z
-                sums[r, c + 1, 6] += w * z * z
-                sums[r, c + 1, 7] += w * variance[r, c]
-    part = np.zeros(8)
-    for r in range(rows):
+    # Of the rows in reach, sums over the columns to the left of: number, w, w x, w xx, w z, w xz, w zz, w variance.
+    band = 2 * reach + 1
+    sums = np.zeros((band, columns + 1, 8))
+    part, slots = np.zeros(8), np.zeros(band, dtype=np.int64)
+    for r in range(-reach, rows):
+        if r + reach < rows:
+            _sum_row(
+                height_m[r + reach],
+                variance[r + reach],
+                known[r + reach],
+                resolution_m,
+                sums[(r + reach) % band],
+            )
+        if r < 0:
+            continue
+        for k in range(band):
+            slots[k] = (r - reach + k) % band
+        low, high = max(-reach, -r), min(reach, rows - 1 - r)
         for c in range(columns):
             if not known[r, c]:
                 continue
             n = s = sx = sy = sz = sxx = sxy = syy = sxz = syz = szz = sv = 0.0
             x0 = c * resolution_m
-            for k in range(-reach, reach + 1):
-                row = r + k
-                if row < 0 or row >= rows:
-                    continue
+            for k in range(low, high + 1):
+                row = slots[k + reach]
                 left = max(0, c - spans[k + reach])
                 right = min(columns, c + spans[k + reach] + 1)
                 for q in range(8):
@@ -203,68 +201,34 @@ def _fit_planes(
 
 
 @njit
-def _known_at(known: NDArray[np.bool_], r: int, c: int) -> bool:
-    return 0 <= r < known.shape[0] and 0 <= c < known.shape[1] and known[r, c]
-
-
-@njit
-def _outer_rise(
+def _sum_row(
     height_m: NDArray[np.float32],
-    known: NDArray[np.bool_],
-    r: int,
-    c: int,
-    dr: int,
-    dc: int,
-    rise: float,
-    most: float,
-) -> float:
-    """What the slope before (r, c) and after (r + dr, c + dc) explains of the rise between them; 0 or its sign."""
-    if not (_known_at(known, r - dr, c - dc) and _known_at(known, r + 2 * dr, c + 2 * dc)):
-        return 0.0
-    sign = 1.0 if rise > 0.0 else -1.0
-    before = sign * (height_m[r, c] - height_m[r - dr, c - dc])
-    after = sign * (height_m[r + 2 * dr, c + 2 * dc] - height_m[r + dr, c + dc])
-    return sign * max(0.0, min(before, after, sign * rise, most))
-
-
-@njit
-def _find_steps(
-    height_m: NDArray[np.float32],
-    single: NDArray[np.float32],
-    drift_m: NDArray[np.float32],
+    variance: NDArray[np.float32],
     known: NDArray[np.bool_],
     resolution_m: float,
-    reach: int,
-    max_slope: float,
-    step: NDArray[np.float32],
-    step_variance: NDArray[np.float32],
+    sums: NDArray[np.float64],
 ) -> None:
-    """Height differences between cells up to `reach` cells apart in the eight directions, less what slope explains.
+    """The running sums of one row for `_fit_planes`: (columns + 1, 8), the first of them zeros."""
+    n = s = sx = sxx = sz = sxz = szz = sv = 0.0
+    for c in range(known.shape[0]):
+        if known[c]:
+            w = _WEIGHT_VARIANCE / (variance[c] + _WEIGHT_VARIANCE)
+            x, z = c * resolution_m, float(height_m[c])
+            n += 1.0
+            s += w
+            sx += w * x
+            sxx += w * x * x
+            sz += w * z
+            sxz += w * x * z
+            szz += w * z * z
+            sv += w * variance[c]
+        row = sums[c + 1]
+        row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7] = n, s, sx, sxx, sz, sxz, szz, sv
 
-    A difference between neighbours belongs to both; over more cells to those in between alone, so that a ledge whose
-    edge lies inside a cell is found and takes no more room than it has.
-    """
-    for r in range(known.shape[0]):
-        for c in range(known.shape[1]):
-            if not known[r, c]:
-                continue
-            for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-                diagonal = dr != 0 and dc != 0
-                length = resolution_m * (math.sqrt(2.0) if diagonal else 1.0)
-                for n in range(1, reach + 1):
-                    if n > 1 and n * length > reach * resolution_m + 1e-6:
-                        break
-                    r1, c1 = r + n * dr, c + n * dc
-                    if not _known_at(known, r1, c1):
-                        continue
-                    rise = float(height_m[r1, c1]) - float(height_m[r, c])
-                    rise -= _outer_rise(height_m, known, r, c, n * dr, n * dc, rise, max_slope * n * length)
-                    doubt = single[r, c] + single[r1, c1] + (drift_m[r, c] - drift_m[r1, c1]) ** 2
-                    low, high = (0, 1) if n == 1 else (1, n - 1)
-                    for k in range(low, high + 1):
-                        rk, ck = r + k * dr, c + k * dc
-                        if known[rk, ck] and abs(rise) > step[rk, ck]:
-                            step[rk, ck], step_variance[rk, ck] = abs(rise), doubt
+
+@njit_borrowing
+def _known_at(known: NDArray[np.bool_], r: int, c: int) -> bool:
+    return 0 <= r < known.shape[0] and 0 <= c < known.shape[1] and known[r, c]
 
 
 @njit
@@ -289,7 +253,7 @@ def _find_drops(
     rows, columns = known.shape
     for r in range(rows):
         for c in range(columns):
-            if not known[r, c]:
+            if not known[r, c] or _inside(known, r, c):
                 continue
             for dr in range(-1, 2):
                 for dc in range(-1, 2):
@@ -320,7 +284,18 @@ def _find_drops(
                             break
 
 
-@njit
+@njit_borrowing
+def _inside(known: NDArray[np.bool_], r: int, c: int) -> bool:
+    """Whether all eight neighbours are in the grid and known."""
+    if r == 0 or c == 0 or r == known.shape[0] - 1 or c == known.shape[1] - 1:
+        return False
+    return (
+        known[r - 1, c - 1] & known[r - 1, c] & known[r - 1, c + 1] & known[r, c - 1]
+        & known[r, c + 1] & known[r + 1, c - 1] & known[r + 1, c] & known[r + 1, c + 1]
+    )  # fmt: skip
+
+
+@njit_borrowing
 def _rise_per_m(
     height_m: NDArray[np.float32], known: NDArray[np.bool_], r: int, c: int, dr: int, dc: int, length: float
 ) -> float:
@@ -368,27 +343,36 @@ def close_holes(
                 variance[r, c] = doubt / n + sigma_m * sigma_m
 
 
+@njit_borrowing
+def _spread(
+    away: NDArray[np.float32], height_m: NDArray[np.float32], r: int, c: int, rn: int, cn: int, cost: float
+) -> None:
+    if away[rn, cn] + cost < away[r, c]:
+        away[r, c] = away[rn, cn] + cost
+        height_m[r, c] = height_m[rn, cn]
+
+
 @njit
 def spread_heights(height_m: NDArray[np.float32], known: NDArray[np.bool_], otherwise_m: float) -> None:
     """Give unknown cells the height of a near known one, in place: two passes over the grid, as a chamfer distance."""
     rows, columns = known.shape
     away = np.where(known, np.float32(0.0), np.float32(np.inf))
     for turn in range(2):
+        back = -1 if turn == 0 else 1
         for i in range(rows):
             r = i if turn == 0 else rows - 1 - i
-            back = -1 if turn == 0 else 1
             for j in range(columns):
                 c = j if turn == 0 else columns - 1 - j
-                for dr, dc, cost in (
-                    (0, back, 1.0),
-                    (back, 0, 1.0),
-                    (back, back, 1.414),
-                    (back, -back, 1.414),
-                ):
-                    rn, cn = r + dr, c + dc
-                    if 0 <= rn < rows and 0 <= cn < columns and away[rn, cn] + cost < away[r, c]:
-                        away[r, c] = away[rn, cn] + cost
-                        height_m[r, c] = height_m[rn, cn]
+                if away[r, c] == 0.0:
+                    continue
+                if j > 0:
+                    _spread(away, height_m, r, c, r, c + back, 1.0)
+                if i > 0:
+                    _spread(away, height_m, r, c, r + back, c, 1.0)
+                    if j > 0:
+                        _spread(away, height_m, r, c, r + back, c + back, 1.414)
+                    if j < columns - 1:
+                        _spread(away, height_m, r, c, r + back, c - back, 1.414)
     for r in range(rows):
         for c in range(columns):
             if away[r, c] == np.inf:

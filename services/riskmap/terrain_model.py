@@ -12,22 +12,19 @@ from planning.grid import GridSpec
 from schemas.base import Pose
 from schemas.sensing import PointCloud, ReadyGrid
 from services.riskmap.cells import (
-    BELOW,
-    CEILING,
-    CEILING_SEEN,
     CHANNELS,
     HIT_WEIGHT,
     HIT_X,
     HIT_Y,
     LOG_ODDS,
     MEAN,
-    SEEN,
     TRAVELLED,
     VARIANCE,
 )
 from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
 from services.riskmap.extrinsics import base_in_odom, body_box, transform, without_body
+from services.riskmap.grid_layers import grid_layers
 from services.riskmap.ground import GroundRules, fuse_ground, join_rings, upright, walk
 from services.riskmap.hazard import Limits, Obstacles, hazard_layers
 from services.riskmap.obstacles import add_hits, clear_pierced
@@ -36,9 +33,7 @@ from services.riskmap.ring import RingWindow
 from services.riskmap.standing import stand_here, start_ground, suppose_start
 from services.riskmap.sweep import read_sweep
 from services.riskmap.terrain import Ground, TerrainMetrics, close_holes, spread_heights, terrain_metrics
-
-_SHARED = 0.1
-"""Share of a supposed height's variance that its neighbours, which were supposed together with it, do not share."""
+from services.riskmap.tops import tops
 
 
 class TerrainModel:
@@ -129,8 +124,7 @@ class TerrainModel:
     def layers(self, robot: Pose) -> tuple[RiskLayers, NDArray[np.float32]]:
         """The risk layers and the ground's height, m; where it is unknown that of a near known cell."""
         c, s = self._config, self._window.spec
-        cells = self._window.ordered()
-        obstacles, height_m, metrics = self.metrics(cells)
+        obstacles, height_m, metrics, ground = self.metrics()
         limits = Limits(
             slope_rad=c.max_slope_rad, step_m=c.max_step_m, roughness_m=c.max_roughness_m, drop_m=c.max_drop_m,
             height_m=c.robot_height_m, limit_hazard_per_m=c.limit_hazard_per_m,
@@ -138,33 +132,29 @@ class TerrainModel:
             clamp_log_odds=c.clamp_log_odds, terrain=not c.risk_blind,
         )  # fmt: skip
         layers = hazard_layers(metrics, obstacles, limits, s.resolution_m, c.alpha, c.max_clearance_m)
-        spread_heights(height_m, cells[VARIANCE] > 0.0, robot.z_m - c.base_height_m)
+        spread_heights(height_m, ground, robot.z_m - c.base_height_m)
         return layers, height_m
 
-    def metrics(self, cells: NDArray[np.float32]) -> tuple[Obstacles, NDArray[np.float32], TerrainMetrics]:
-        """What stands in each cell, the ground's height, and its metrics, from the window's layers (CHANNELS, h, w)."""
+    def tops(self, ground_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Height of the ground or of what stands on it, (h, w) m."""
+        return tops(self._window.cells, self._window.origin, ground_m, self._config.robot_height_m)
+
+    def metrics(
+        self,
+    ) -> tuple[Obstacles, NDArray[np.float32], TerrainMetrics, NDArray[np.bool_]]:
+        """What stands in each cell; the ground's height, its metrics, and whether it is known; (h, w) each."""
         c, res = self._config, self._window.spec.resolution_m
-        height_m = cells[MEAN].copy()
-        ground = cells[VARIANCE] > 0.0
-        drift_m = np.where(ground, c.height_drift_per_m * (self._travelled_m - cells[TRAVELLED]), 0.0)
-        drift_m = drift_m.astype(np.float32)
-        variance = np.where(ground, cells[VARIANCE], 0.0).astype(np.float32)
-        single = np.where(cells[SEEN] > 0.0, variance, np.float32(_SHARED) * variance)
-        blocked = cells[LOG_ODDS] > 0.0
-        known = ground & ~blocked  # what lies at the foot of an obstacle is no ground to drive on
-        bounded = (cells[SEEN] == BELOW) & ~ground
-        close_holes(height_m, variance, known, blocked, c.max_step_m, c.fill_sigma_per_m * res)
-        covered = (cells[CEILING_SEEN] > 0.0) & ground
-        room = np.where(covered, cells[CEILING] - cells[MEAN], np.inf).astype(np.float32)
-        room_variance = np.where(covered, variance + drift_m**2 + c.range_sigma_m**2, 0.0).astype(np.float32)
-        hit = blocked & (cells[HIT_WEIGHT] > 0.0)
-        hit_x, hit_y = (np.where(hit, cells[k], 0.0).astype(np.float32) for k in (HIT_X, HIT_Y))
-        obstacles = Obstacles(cells[LOG_ODDS], hit_x, hit_y, room, room_variance)
+        g = grid_layers(
+            self._window.cells, self._window.origin, self._travelled_m, c.height_drift_per_m, c.range_sigma_m
+        )
+        known = g.ground & ~g.blocked  # what lies at the foot of an obstacle is no ground to drive on
+        close_holes(g.height_m, g.variance, known, g.blocked, c.max_step_m, c.fill_sigma_per_m * res)
+        obstacles = Obstacles(g.log_odds, g.hit_x, g.hit_y, g.room_m, g.room_variance)
         metrics = terrain_metrics(
-            Ground(height_m, variance, single, drift_m, known, bounded & ~known), res, c.footprint_radius_m,
-            math.tan(c.max_slope_rad), c.step_reach_m, c.drop_reach_m,
+            Ground(g.height_m, g.variance, g.single, g.drift_m, known, g.bounded & ~known), res,
+            c.footprint_radius_m, math.tan(c.max_slope_rad), c.step_reach_m, c.drop_reach_m,
         )  # fmt: skip
-        return obstacles, height_m, metrics
+        return obstacles, g.height_m, metrics, g.ground
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""

@@ -59,9 +59,11 @@ class Judge:
             robot = robot or RobotConfig(footprint_radius_m=footprint_radius_m)
             solid = cut(body_solid(world, robot.height_m), self._cuts)
             free = acceptable_ground(self.spec, solid, self._floor_m, robot)
-            self.reachable = reachable_part(self.spec, free, world.start, footprint_radius_m)
         else:
-            self.reachable = reachable_ground(self.spec, self.occupied, world.start, footprint_radius_m)
+            free = configuration_space(self.occupied, footprint_radius_m / self.spec.resolution_m)
+        self.roamed = roamed_part(self.spec, free, world.start)
+        """bool[height, width] on `spec`: where the middle of the footprint can be, when the judge begins."""
+        self.reachable = swept_part(self.spec, self.roamed, footprint_radius_m)
         """bool[height, width] on `spec`: ground that the footprint can sweep over."""
         self.covered = np.zeros(self.spec.shape, dtype=np.bool_)
         """bool[height, width] on `spec`: reachable ground seen so far."""
@@ -80,19 +82,45 @@ class Judge:
         x, y = x_m / cell - self.spec.ix0, y_m / cell - self.spec.iy0
         low_x, low_y, high_x, high_y = self._box or (x, y, x, y)
         self._box = (min(low_x, x), min(low_y, y), max(high_x, x), max(high_y, y))
-        view = np.array([x, y, math.cos(yaw_rad), math.sin(yaw_rad)])
-        if self._floor_m is None:
-            new = look(
-                self.occupied, self._pending, self.covered, view, self._range_cells, self._cos_half_fov
-            )
-        else:
-            view = np.append(view, height_at(self._floor_m, x, y) + self._sensor_height_m)
-            new = look_over(
-                self.occupied, self._floor_m, self._ceiling_m, self._pending, self.covered, view,
-                self._range_cells, self._cos_half_fov,
-            )  # fmt: skip
+        new = self._look(x, y, yaw_rad, self._pending, self.covered, self._cos_half_fov)
         self._covered_cells += new
         return new
+
+    def look_around(
+        self, x_m: float, y_m: float, pending: NDArray[np.bool_], seen: NDArray[np.bool_]
+    ) -> tuple[slice, slice]:
+        """Move the cells of `pending` (bool on `spec`) that the sensor would see from a point, if it turned all around,
+        to `seen` (both changed in place); what is covered stays as it is. Returns the rows and columns looked at."""
+        cell, reach = self.spec.resolution_m, self._range_cells
+        x, y = x_m / cell - self.spec.ix0, y_m / cell - self.spec.iy0
+        self._look(x, y, 0.0, pending, seen, -2.0)
+        rows = slice(max(0, math.floor(y - reach)), max(0, math.floor(y + reach) + 1))
+        return rows, slice(max(0, math.floor(x - reach)), max(0, math.floor(x + reach) + 1))
+
+    def _look(
+        self,
+        x: float,
+        y: float,
+        yaw_rad: float,
+        pending: NDArray[np.bool_],
+        seen: NDArray[np.bool_],
+        cos_half_fov: float,
+    ) -> int:
+        """Look from a point in cells; `pending` and `seen` are changed in place. Returns how many cells were seen."""
+        view = np.array([x, y, math.cos(yaw_rad), math.sin(yaw_rad)])
+        if self._floor_m is None:
+            return look(self.occupied, pending, seen, view, self._range_cells, cos_half_fov)
+        view = np.append(view, height_at(self._floor_m, x, y) + self._sensor_height_m)
+        return look_over(
+            self.occupied,
+            self._floor_m,
+            self._ceiling_m,
+            pending,
+            seen,
+            view,
+            self._range_cells,
+            cos_half_fov,
+        )
 
     def close(self, occupied: NDArray[np.bool_], robot_m: tuple[float, float]) -> None:
         """Take over new walls (on the world's cells) after a door has closed, with the robot at a point.
@@ -190,15 +218,20 @@ def reachable_ground(
     Raises StartError if the disc fits on no cell next to the start.
     """
     free = configuration_space(occupied, footprint_radius_m / spec.resolution_m)
-    return reachable_part(spec, free, start, footprint_radius_m)
+    return swept_part(spec, roamed_part(spec, free, start), footprint_radius_m)
 
 
-def reachable_part(
-    spec: GridSpec, free: NDArray[np.bool_], start: tuple[float, float, float], footprint_radius_m: float
+def roamed_part(
+    spec: GridSpec, free: NDArray[np.bool_], start: tuple[float, float, float]
 ) -> NDArray[np.bool_]:
-    """What the disc sweeps while its centre roams the part of `free` that holds the start. Raises StartError."""
+    """The 4-connected part of `free` that holds the start. Raises StartError."""
     row, column = _nearest_free(spec, free, start)
-    return dilate(flood(free, row, column), disc_holds_centre(footprint_radius_m / spec.resolution_m), False)
+    return flood(free, row, column)
+
+
+def swept_part(spec: GridSpec, roamed: NDArray[np.bool_], footprint_radius_m: float) -> NDArray[np.bool_]:
+    """What the disc sweeps while its centre roams these cells."""
+    return dilate(roamed, disc_holds_centre(footprint_radius_m / spec.resolution_m), False)
 
 
 def _nearest_free(

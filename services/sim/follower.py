@@ -39,7 +39,8 @@ class TimedPath:
     """A path with times. All arrays are float64[n], n >= 1.
 
     Points at one place with different yaws are a turn on the spot; the follower makes it at the path's end
-    only, as elsewhere the way on sets the heading. Raises ValueError on empty or unequal arrays, numbers that
+    only, as elsewhere the way on sets the heading. A path whose first yaw points against its way is driven backwards.
+    Raises ValueError on empty or unequal arrays, numbers that
     are not finite, negative speeds, times that run backwards, or a `ttl_s` that is not positive.
     """
 
@@ -99,6 +100,8 @@ class _Profile(NamedTuple):
     """Also slow enough for every corner, slow point and the end ahead."""
     leg_bounds_m: NDArray[np.float64]
     """Arc lengths of the start, of the sharp corners, and of the end."""
+    backwards: bool
+    """The robot's back goes first."""
 
 
 @dataclass(frozen=True)
@@ -196,7 +199,8 @@ class Follower:
         if self.state.leg < profile.leg_bounds_m.size - 2:  # never past a sharp corner: it would be cut
             goal = min(goal, float(profile.leg_bounds_m[self.state.leg + 1]))
         goal_x, goal_y = _point(profile, goal)
-        bearing = math.remainder(math.atan2(goal_y - y_m, goal_x - x_m) - yaw_rad, 2.0 * math.pi)
+        ahead_rad = yaw_rad + (math.pi if profile.backwards else 0.0)
+        bearing = math.remainder(math.atan2(goal_y - y_m, goal_x - x_m) - ahead_rad, 2.0 * math.pi)
         on_spot = abs(bearing) > (_SPOT_END_RAD if self.state.on_spot else _SPOT_BEGIN_RAD)
         self.state = replace(self.state, on_spot=on_spot)
         if on_spot:
@@ -204,7 +208,7 @@ class Follower:
         curvature = 2.0 * math.sin(bearing) / max(math.hypot(goal_x - x_m, goal_y - y_m), 1e-6)
         if abs(curvature) * speed > self.robot.max_turn_rate_radps:
             speed = self.robot.max_turn_rate_radps / abs(curvature)
-        return speed, curvature * speed
+        return -speed if profile.backwards else speed, curvature * speed
 
     def _turn_rate(self, error_rad: float) -> float:
         """Turn on the spot, slow enough to stop at the goal."""
@@ -272,7 +276,18 @@ def _resample(path: TimedPath, robot: RobotConfig) -> _Profile:
     safe[-1] = 0.0
     twice = 2.0 * _BRAKING_SHARE * robot.max_acceleration_mps2
     safe = np.sqrt(np.maximum(np.minimum.accumulate((safe**2 + twice * at)[::-1])[::-1] - twice * at, 0.0))
-    return _Profile(at, x, y, speed, safe, np.concatenate([[0.0], corners, [length]]))
+    bounds = np.concatenate([[0.0], corners, [length]])
+    return _Profile(at, x, y, speed, safe, bounds, _is_backwards(path))
+
+
+def _is_backwards(path: TimedPath) -> bool:
+    """Whether the path's first yaw points against its first step."""
+    moving = np.flatnonzero(np.hypot(np.diff(path.x_m), np.diff(path.y_m)) > 1e-6)
+    if moving.size == 0:
+        return False
+    i = int(moving[0])
+    way = math.atan2(path.y_m[i + 1] - path.y_m[i], path.x_m[i + 1] - path.x_m[i])
+    return math.cos(way - float(path.yaw_rad[i])) < 0.0
 
 
 def _turns(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,15 +14,25 @@ from services.sim.noise import Field, line_noise, octave
 from services.sim.passages import Passage, curve, grid_around, hollow, passage
 from services.sim.world import World
 
-_SECTIONS = 9
+_SECTIONS, _SHORT_SECTIONS = 9, 4
 _SECTION_M = 26.0
-_POCKETS = 9
 
 
 def lava_tube(seed: int) -> World:
     """One broad winding tube, 6 to 15 m wide and some 236 m long, with pockets at its sides."""
+    return _lava_tube("lava_tube", seed, _SECTIONS)
+
+
+def short_lava_tube(seed: int) -> World:
+    """The same but 105 m long, with 4 pockets."""
+    return _lava_tube("short_lava_tube", seed, _SHORT_SECTIONS)
+
+
+def _lava_tube(name: str, seed: int, sections: int) -> World:
+    """What is scattered along the tube goes by its length; a pocket a section."""
     rng = np.random.default_rng([seed, 104])
-    passages = tube_plan(rng)
+    passages = tube_plan(rng, sections)
+    share = sections / _SECTIONS
     spec = grid_around(passages, RESOLUTION_M, margin_m=2.0)
     start = tuple(passages[0].line_m[16].tolist())
     space = rough_walls(spec, hollow(spec, passages), rng)
@@ -32,20 +42,20 @@ def lava_tube(seed: int) -> World:
     smooth = ground.floor_m.copy()
     _ropes(spec, ground, rng)
     ground.talus(0.9, 0.8, -0.7)
-    ground.mounds(11, (1.0, 3.0), (0.4, 1.2))
-    ground.drop_offs(3, (1.5, 3.0), (0.4, 1.2))
-    ground.pits(12, (0.5, 1.2), (0.6, 2.0))
-    ground.rubble(16, (0.8, 2.0), 0.16)
-    ground.boulders(75, (0.25, 0.9), (0.25, 1.2))
+    ground.mounds(round(11 * share), (1.0, 3.0), (0.4, 1.2))
+    ground.drop_offs(round(3 * share), (1.5, 3.0), (0.4, 1.2))
+    ground.pits(round(12 * share), (0.5, 1.2), (0.6, 2.0))
+    ground.rubble(round(16 * share), (0.8, 2.0), 0.16)
+    ground.boulders(round(75 * share), (0.25, 0.9), (0.25, 1.2))
     ceiling = vault(spec, smooth, space, ground.aside, rng, height_m=3.4)
     _skylights(spec, ceiling, passages[0], rng)
-    return underground("lava_tube", spec, space, ground.floor_m, ceiling, start)
+    return underground(name, spec, space, ground.floor_m, ceiling, start)
 
 
-def tube_plan(rng: np.random.Generator) -> list[Passage]:
-    """The main tube first, then its pockets."""
+def tube_plan(rng: np.random.Generator, sections: int = _SECTIONS) -> list[Passage]:
+    """The main tube first, then its pockets, as many as sections."""
     heading, at, points = 0.0, np.zeros(2), [np.zeros(2)]
-    for _ in range(_SECTIONS):
+    for _ in range(sections):
         # Winding about one direction: a tube follows the slope of its flow and does not cross itself.
         heading = float(np.clip(0.35 * heading + rng.uniform(-1.0, 1.0), -1.1, 1.1))
         at = at + _SECTION_M * np.array([math.cos(heading), math.sin(heading)])
@@ -56,13 +66,13 @@ def tube_plan(rng: np.random.Generator) -> list[Passage]:
     half = np.clip(half, 3.2, 7.2)
     half[:28] = np.maximum(half[:28], 5.0)
     tube = passage(line, half, rng)
-    return [tube, *(_pocket(tube, k, rng) for k in range(_POCKETS))]
+    return [tube, *(_pocket(tube, k, sections, rng) for k in range(sections))]
 
 
-def _pocket(tube: Passage, index: int, rng: np.random.Generator) -> Passage:
+def _pocket(tube: Passage, index: int, pockets: int, rng: np.random.Generator) -> Passage:
     """A short auxiliary tube off the main one."""
     count = len(tube.line_m)
-    at = int((index + 0.6 + rng.uniform(-0.3, 0.3)) * count / (_POCKETS + 0.5))
+    at = int((index + 0.6 + rng.uniform(-0.3, 0.3)) * count / (pockets + 0.5))
     along = tube.line_m[min(at + 2, count - 1)] - tube.line_m[at - 2]
     along /= math.hypot(*along)
     side = np.array([-along[1], along[0]]) * (1.0 if rng.random() < 0.5 else -1.0)

@@ -12,7 +12,7 @@ from services.sim.config import LidarConfig
 from services.sim.geometry import ray_length
 from services.sim.scene import Scene
 from services.sim.terrain import rotation, terrain_of
-from services.sim.terrain_lidar import cast_rays, hide_behind_movers, patch_bounds
+from services.sim.terrain_lidar import Bounds, bounds_of, cast_rays, hide_behind_movers
 from services.sim.world import WALL_HEIGHT_M, World
 
 
@@ -89,7 +89,7 @@ class Lidar:
         self._directions[..., 2] = np.sin(elevations)
         self._limits = np.array([world.spec.resolution_m, config.range_m, config.height_m, WALL_HEIGHT_M])
         self._terrain = terrain_of(world) if world.has_terrain else None
-        self._bounds: NDArray[np.float32] | None = None
+        self._bounds: Bounds | None = None
         self._bounds_of: NDArray[np.bool_] | None = None
 
     def ranges(
@@ -123,7 +123,7 @@ class Lidar:
         assert self._terrain is not None
         occupied = self._scene.occupied
         if self._bounds is None or self._bounds_of is not occupied:
-            self._bounds = patch_bounds(occupied, self._terrain.floor_m, self._terrain.ceiling_m)
+            self._bounds = bounds_of(occupied, self._terrain)
             self._bounds_of = occupied
         x, y = self._world.to_cells(float(origin_m[0]), float(origin_m[1]))
         origin = np.array([x, y, origin_m[2]])

@@ -245,7 +245,9 @@ class SimStage:
         return CoverageScan(
             stamp_ns=now,
             keyframe_id=nearest,
-            pose_in_odom=self._pose(),
+            pose_in_odom=self._pose().model_copy(
+                update={"z_m": self._robot.state.z_m + self._config.lidar.height_m}
+            ),
             pose_in_keyframe=Pose(x_m=inside.x_m, y_m=inside.y_m, yaw_rad=inside.yaw_rad),
             range_m=sensor.range_m,
             fov_rad=math.radians(sensor.fov_deg),

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from services.sim.cave import cave
 from services.sim.config import SimConfig
 from services.sim.elevation import load_elevation_world
-from services.sim.lava_tube import lava_tube
+from services.sim.lava_tube import lava_tube, short_lava_tube
 from services.sim.map_server import load_map_server
 from services.sim.maze import maze
 from services.sim.mesh import load_mesh_world
@@ -50,6 +50,7 @@ __all__ = [
     "load_mesh_world",
     "make_world",
     "maze",
+    "short_lava_tube",
     "subway",
     "with_start",
 ]
@@ -61,6 +62,7 @@ _MAKERS: dict[str, Callable[[int], World]] = {
     "maze": maze,
     "cave": cave,
     "lava_tube": lava_tube,
+    "short_lava_tube": short_lava_tube,
     "unreachable_slit": lambda seed: unreachable_slit(),
     "unknown_start": lambda seed: unknown_start(),
     "maze_bend": lambda seed: maze_bend(),

@@ -198,7 +198,8 @@ def test_by_default_a_target_is_kept_for_one_that_is_better_by_ten_nats() -> Non
 
 
 @pytest.mark.parametrize(
-    ("left", "near_m", "switches"), [(0.5, 10.0, True), (5.0, 10.0, False), (0.5, 30.0, False)]
+    ("left", "near_m", "switches"),
+    [(0.5, 10.0, True), (5.0, 10.0, False), (0.9, 30.0, False), (0.5, 30.0, True)],
 )
 def test_a_crumb_of_a_far_target_is_no_reason_to_pass_others(
     left: float, near_m: float, switches: bool

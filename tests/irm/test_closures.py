@@ -88,6 +88,7 @@ class Loop:
             hazard_cvar=hazard,
             clearance_m=clearance_m(state == LETHAL, None, None, spec, MAX_CLEARANCE_M),
             elevation_m=zeros,
+            top_m=np.zeros((0, 0), np.float32),
         )
 
     def feeds(self, graph: bool = True, frame: Planar | None = None) -> Inputs:

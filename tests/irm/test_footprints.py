@@ -17,6 +17,7 @@ from schemas.snapshot import pack_snapshot, unpack_snapshot
 from services.irm.footprints import FootprintStore
 from services.irm.resample import resample
 from services.irm.tiles import TileLayer
+from services.irm.window import Relief
 from tests.irm.worlds import DETECTION, scan_at
 
 ORIGIN = Planar(0.0, 0.0, 0.0)
@@ -241,3 +242,25 @@ def test_resampling_by_whole_cells_copies(seed: int, dx: int, dy: int) -> None:
             if target.contains(row, column):
                 expected[row, column] = values[r, c]
     assert np.array_equal(out, expected)
+
+
+def test_on_rough_ground_a_look_passes_over_low_blocks_and_not_over_walls() -> None:
+    """From 0.8 m, a strip of 0.3 m at 2 m hides what lies up to 2.8 m away; on flat ground, all behind it."""
+    spec = GridSpec(RES, 0, 0, round(6.0 / RES), round(2.0 / RES))
+    state = np.full(spec.shape, FREE, np.uint8)
+    x = np.tile(spec.centres_x(), (spec.height, 1))
+    strip = (x > 2.0) & (x < 2.0 + RES)
+    state[strip] = LETHAL
+    ground = np.zeros(spec.shape, np.float32)
+    scan = scan_at(Planar(0.05, 1.05, 0.0), range_m=5.5, fov_rad=1.0)
+    scan = scan.model_copy(update={"pose_in_odom": scan.pose_in_odom.model_copy(update={"z_m": 0.8})})
+    far = {}
+    for name, height_m in (("low", 0.3), ("wall", 50.0), ("flat", None)):
+        layer, store = layer_and_store()
+        top = np.where(strip, np.float32(height_m or 0.0), ground)
+        relief = None if height_m is None else Relief(ground, top.astype(np.float32))
+        store.add(scan, ORIGIN, state, spec, ORIGIN, relief)
+        middle = layer.read(spec)[spec.cell_of(0.05, 1.05)[0]]
+        far[name] = spec.centres_x()[middle > 0]
+    assert ((far["low"] < 2.0) | (far["low"] > 2.7)).all() and far["low"].max() > 5.0
+    assert far["wall"].max() < 2.0 and far["flat"].max() < 2.0

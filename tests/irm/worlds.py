@@ -60,6 +60,7 @@ class Flat:
             hazard_cvar=hazard,
             clearance_m=clearance_m(state == LETHAL, None, None, spec, MAX_CLEARANCE_M),
             elevation_m=np.zeros(spec.shape, np.float32),
+            top_m=np.zeros((0, 0), np.float32),
         )
 
     def fill(self, x_low: float, y_low: float, x_high: float, y_high: float, state: int) -> Flat:

@@ -32,9 +32,9 @@ def coverage(settled: bool, area_m2: float = 10.0) -> CoverageSummary:
     return CoverageSummary(
         stamp_ns=0,
         irm_version=1,
-        reachable_area_m2=100.0,
+        reachable_area_m2=max(100.0, area_m2),
         covered_area_m2=area_m2,
-        covered_fraction=area_m2 / 100.0,
+        covered_fraction=area_m2 / max(100.0, area_m2),
         entropy_left=0.0,
         frontiers=1,
         frontier_gain=1.0,
@@ -161,3 +161,22 @@ def test_spec_and_unknown_keys() -> None:
     assert spec(Config(period_s=0.5)).period_ns == SECOND_NS // 2
     with pytest.raises(ValueError, match="no_such_key"):
         Config.model_validate({"no_such_key": 1})
+
+
+@pytest.mark.parametrize(
+    ("worth_m_per_nat", "area_m2", "covered"),
+    [
+        (4.0, 1000.0, True),  # 2 nats at 10 m are worth 8 m, and little beside 1000 m2
+        (6.0, 1000.0, False),  # worth 12 m
+        (4.0, 100.0, False),  # as much as 2 % of the ground known is not left
+        (0.0, 1000.0, False),  # all is worth any way
+    ],
+)
+def test_little_that_is_far_away_is_left(worth_m_per_nat: float, area_m2: float, covered: bool) -> None:
+    bench = Bench(settle_s=1.0, worth_m_per_nat=worth_m_per_nat)
+    bench.step((ODOMETRY, odometry(20.0)), (GLOBAL_IRM, corridor(1)))
+    for _ in range(5):
+        state = bench.step((COVERAGE, coverage(settled=False, area_m2=area_m2)))
+    assert (state.phase == MissionPhase.DONE) == covered
+    if covered:
+        assert "not worth the way" in state.reason

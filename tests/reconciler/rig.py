@@ -193,6 +193,7 @@ class Rig:
             hazard_cvar=zero,
             clearance_m=clearance_m(self.lethal, None, None, s),
             elevation_m=zero,
+            top_m=np.zeros((0, 0), np.float32),
         )
 
     def wall_at(self, x_m: float, y_m: float, half_m: float = 0.3) -> None:

@@ -16,6 +16,7 @@ from schemas.snapshot import unpack_snapshot
 from schemas.topics import LOCAL_POLICY, RISK_MAP
 from services.reconciler.config import Config
 from services.reconciler.stage import create, spec
+from services.reconciler.trail import Trail
 from tests.reconciler.rig import FOOTPRINT_M, TICK_NS, Rig
 from tests.runtime.feeding import Feed
 
@@ -406,15 +407,58 @@ def test_dropping_the_path_drops_the_episode_that_was_to_continue_it() -> None:
     assert len(rig.requests) > asked + 1, "another episode was opened at once"
 
 
-def test_blocked_for_long_it_drops_the_path() -> None:
+def test_blocked_for_long_it_backs_off_on_the_way_that_it_came() -> None:
     rig = driving()
+    came = rig.yaw_rad
     rig.moving, rig.follower_blocked = False, True
     rig.run(FEW.blocked_s - 0.1)
-    assert rig.last().valid
+    assert rig.last().valid and "backs off" not in rig.last().reason
+    rig.run(0.3)
+    plan = rig.last()
+    assert plan.valid and plan.reason == "blocked: backs off"
+    x, y = plan.x_m[-1] - rig.x_m, plan.y_m[-1] - rig.y_m
+    assert 0.7 * FEW.back_off_m <= math.hypot(x, y) <= FEW.back_off_m + 0.01  # the way may bend
+    assert x * math.cos(came) + y * math.sin(came) < -0.8 * FEW.back_off_m
+    assert np.cos(plan.yaw_rad[0] - came) > 0.8, "it faces what it was blocked by"
+    assert plan.speed_mps.max() <= FEW.min_speed_mps
+    begun = rig.x_m, rig.y_m
+    rig.moving, rig.follower_blocked = True, False
+    episodes = len(rig.requests)
+    rig.run(1.0)
+    assert len(rig.requests) == episodes, "no episode while it backs off"
+    rig.run(3.0)
+    assert len(rig.requests) > episodes
+    assert rig.last().valid and "backs off" not in rig.last().reason
+    assert math.dist(begun, (rig.x_m, rig.y_m)) > 0.3
+
+
+def test_blocked_while_it_backs_off_it_plans_anew() -> None:
+    rig = driving()
+    rig.moving, rig.follower_blocked = False, True
+    rig.run(FEW.blocked_s + 0.3)
+    assert rig.last().reason == "blocked: backs off"
     seen = len(rig.plans)
-    rig.run(0.6)
+    rig.run(FEW.blocked_s + 0.2)
     dropped = [plan for plan in rig.plans[seen:] if plan.reason == "blocked"]
     assert dropped and not dropped[0].valid
+
+
+def test_the_trail_goes_back_the_way_it_came_and_no_farther() -> None:
+    trail = Trail(2.0)
+    for k in range(100):
+        trail.add(0.03 * k, 0.0)
+    back = trail.back(2.97, 0.0, 0.5)
+    assert np.allclose(back[0], [2.97, 0.0]) and np.allclose(back[-1], [2.47, 0.0])
+    assert (
+        np.hypot(*(trail.back(2.97, 0.0, 10.0)[-1] - [2.97, 0.0])) <= 1.3 * 2.0 + 0.1
+    )  # every second point is 0.06 m on
+    for k in range(20):
+        trail.add(2.97 - 0.03 * k, 0.0)
+    assert trail.back(2.4, 0.0, 0.5)[-1][0] < 2.0, "what was driven back over is no part of the way any more"
+    other = Trail(2.0)
+    other.load(trail.state())
+    assert np.array_equal(other.back(2.4, 0.0, 1.0), trail.back(2.4, 0.0, 1.0))
+    assert len(Trail(1.0).back(0.0, 0.0, 1.0)) == 1
 
 
 def test_after_a_restart_ids_go_on_increasing() -> None:

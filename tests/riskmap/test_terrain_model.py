@@ -17,6 +17,7 @@ from schemas.sensing import PointCloud
 from services.riskmap.cells import CEILING, CEILING_SEEN, LOG_ODDS, MEAN, SEEN, VARIANCE
 from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
+from services.riskmap.flat_model import FlatModel
 from services.riskmap.ring import RingWindow
 from services.riskmap.terrain_model import TerrainModel
 from tests.riskmap.rough import MOUNT, Heights, cloud_at, flat, ledge, plane, stand_on
@@ -178,6 +179,25 @@ def test_crowns_and_decks_are_ceiling_and_not_ground() -> None:
     assert cells[CEILING][covered] == pytest.approx(2.2, abs=0.1)
     assert np.abs(cells[MEAN][cells[VARIANCE] > 0]).max() < 0.1
     assert not (state == LETHAL).any()
+
+
+def test_ground_that_rises_is_no_ceiling_of_itself() -> None:
+    """Seen from afar, with nothing known of what leads there, a slope's far part hangs in the air."""
+    y = np.arange(-0.5, 0.5, 0.01)
+
+    def slope(*xs: float) -> NDArray[np.float64]:
+        return np.concatenate(
+            [np.stack([0.0 * y + x, y, 0.0 * y + max(0.0, 0.4 * (x - 4.0))], axis=1) for x in xs]
+        )
+
+    model = TerrainModel(config(profile="spot"))
+    model.integrate(sparse_cloud(slope(3.0, 3.9, 8.05), 1))
+    assert at(model, cells_of(model)[CEILING_SEEN], 8.05, 0.05) > 0, "taken for something overhead at first"
+    for k in range(3):
+        model.integrate(sparse_cloud(slope(*np.arange(2.0, 9.0, 0.05)), k + 2))
+    state = layers_of(model, Pose()).state
+    near = [int(at(model, state, x, 0.05)) for x in (7.85, 7.95, 8.05, 8.15)]
+    assert near == [FREE] * 4
 
 
 def test_a_beam_below_the_robots_height_is_an_obstacle() -> None:
@@ -362,3 +382,23 @@ def test_the_place_in_odom_does_not_matter(where: tuple[float, float]) -> None:
     other.roll_to(base.x_m, base.y_m)
     other.integrate(cloud_at(moved, base, points_m=cloud.points_m))
     assert (layers_of(one, Pose()).state == layers_of(other, Pose()).state).mean() > 0.995
+
+
+def test_tops_are_those_of_ground_of_what_stands_on_it_and_of_walls() -> None:
+    """A rock of half a metre is as high as it is; what reaches the robot's height counts as a wall."""
+
+    def world(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        rock = np.where((np.abs(x - 4.0) < 0.3) & (np.abs(y) < 0.3), 0.5, 0.0)
+        return np.where(x > 7.0, 3.0, rock)
+
+    model, base = drive(world, np.arange(0.0, 2.0, 0.1))
+    height_m = model.layers(base)[1]
+    top = model.tops(height_m)
+    assert at(model, top, 2.05, 1.05) == pytest.approx(0.0, abs=0.05)
+    assert at(model, top, 3.75, 0.05) == pytest.approx(0.5, abs=0.12)
+    assert at(model, top, 7.05, 0.05) > 50.0
+
+
+def test_flat_models_have_no_tops() -> None:
+    model = FlatModel(Config(window_m=6.0))
+    assert model.tops(model.layers(Pose())[1]).shape == (0, 0)

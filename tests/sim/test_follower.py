@@ -231,3 +231,14 @@ def test_bad_paths_are_refused(change: dict[str, Any], message: str) -> None:
     two_points = TimedPath(ends, ends, ends, ends, ends, 0.0, 1.0)
     with pytest.raises(ValueError, match=message):
         replace(two_points, **change)
+
+
+def test_a_path_whose_yaw_points_against_its_way_is_driven_backwards() -> None:
+    path = _path([(6.0, 5.0), (5.0, 5.0), (4.0, 5.4)], speed=0.4)
+    back = replace(path, yaw_rad=np.remainder(path.yaw_rad + 2.0 * math.pi, 2.0 * math.pi) - math.pi)
+    commands, poses, robot = _drive(box(10.0, 10.0, start=(6.0, 5.0, 0.0)), back, 15.0)
+    assert commands[-1].arrived
+    assert math.hypot(robot.state.x_m - 4.0, robot.state.y_m - 5.4) < 0.1
+    assert np.abs(poses[:, 2]).max() < 0.6, "it never turned round"
+    assert min(c.speed_mps for c in commands) < -0.3
+    assert _distance_to(path, poses).max() < 0.08

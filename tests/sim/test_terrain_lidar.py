@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from planning.grid import GridSpec
 from services.sim.config import LidarConfig
 from services.sim.lidar import Lidar
-from services.sim.terrain import rotation
+from services.sim.terrain import rotation, terrain_of
+from services.sim.terrain_lidar import bounds_of, cast_rays
 from services.sim.world import World
 from tests.sim.helpers import box, with_walls
 from tests.sim.terrains import bilinear, ground, march, ramp
@@ -57,6 +58,30 @@ def test_every_range_is_that_of_the_marcher(seed: int, roll: float, pitch: float
             assert ranges[a, k] < marched + 1e-4 or math.isinf(marched)
             if ranges[a, k] < marched - STEP_M - 1e-4:
                 assert march(world, origin + way * (ranges[a, k] - 1e-5), way, 2e-5, 1e-7) < math.inf
+
+
+@given(st.integers(0, 10_000), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-3.0, 3.0))
+@settings(max_examples=30, deadline=None)
+def test_striding_over_clear_regions_changes_no_bit(seed: int, roll: float, pitch: float, yaw: float) -> None:
+    """Against the walk patch by patch, which regions that are never clear leave."""
+    world = _rough_world(seed)
+    terrain = terrain_of(world)
+    bounds = bounds_of(world.occupied, terrain)
+    never = np.full((0, 0, 2), 1e30, dtype=np.float32)
+    elevations, azimuths = np.radians(np.linspace(-40.0, 40.0, 9)), np.linspace(0.0, 6.2, 60)
+    directions = np.empty((60, 9, 3), dtype=np.float32)
+    directions[..., 0] = np.cos(azimuths)[:, None] * np.cos(elevations)
+    directions[..., 1] = np.sin(azimuths)[:, None] * np.cos(elevations)
+    directions[..., 2] = np.sin(elevations)
+    x, y = world.to_cells(*world.start[:2])
+    rest = (
+        np.array([x + 0.3, y - 0.2, 0.7]), rotation(roll, pitch, yaw), directions,
+        np.array([world.spec.resolution_m, 4.0]),
+    )  # fmt: skip
+    fast = cast_rays(world.occupied, terrain, bounds, *rest)
+    plain = cast_rays(world.occupied, terrain, bounds._replace(coarse=never, fine=never), *rest)
+    assert np.array_equal(fast, plain)
+    assert (bounds.fine[..., 0] < 1e29).any()
 
 
 def test_points_of_a_slope_lie_on_it_whatever_the_lean() -> None:
