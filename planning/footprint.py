@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from planning.grid import FREE, LETHAL, UNKNOWN, GridSpec
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 
 _FREE = FREE
 _LETHAL = LETHAL
@@ -136,7 +136,7 @@ def footprint_hazard(
     return np.maximum(result, np.float32(0.0))
 
 
-@njit
+@njit_borrowing
 def bilinear(field: NDArray[np.float32], column: float, row: float) -> float:
     """Value of the field at fractional cell-centre coordinates; clamped to the border cells outside."""
     height, width = field.shape
@@ -153,12 +153,12 @@ def bilinear(field: NDArray[np.float32], column: float, row: float) -> float:
     return low * (1.0 - v) + high * v
 
 
-@njit
+@njit_borrowing
 def _substeps(length_m: float, resolution_m: float) -> int:
     return max(1, int(math.ceil(length_m / min(0.5 * resolution_m, _MAX_SUBSTEP_M) - 1e-9)))
 
 
-@njit
+@njit_borrowing
 def segment_risk(
     footprint_hazard_per_m: NDArray[np.float32],
     resolution_m: float,
@@ -192,7 +192,7 @@ def segment_risk(
     return length, total * length / steps
 
 
-@njit
+@njit_borrowing
 def segment_min_clearance(
     clearance: NDArray[np.float32],
     resolution_m: float,
@@ -212,7 +212,7 @@ def segment_min_clearance(
     return _min_clearance_above(clearance, resolution_m, ix0, iy0, x0_m, y0_m, x1_m, y1_m, -np.inf)
 
 
-@njit
+@njit_borrowing
 def _min_clearance_above(
     clearance: NDArray[np.float32],
     resolution_m: float,
@@ -238,7 +238,7 @@ def _min_clearance_above(
     return best
 
 
-@njit
+@njit_borrowing
 def segment_state(
     state: NDArray[np.uint8],
     resolution_m: float,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from planning.footprint import segment_min_clearance, segment_risk
 from planning.grid import DIRECTION_DX, DIRECTION_DY
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 from planning.search import dijkstra_box, trace_path
 
 _DX = DIRECTION_DX
@@ -257,7 +257,7 @@ def _connect(
     return bent
 
 
-@njit
+@njit_borrowing
 def line_in(
     mask: NDArray[np.bool_],
     resolution_m: float,
@@ -278,7 +278,7 @@ def line_in(
     return True
 
 
-@njit
+@njit_borrowing
 def set_edge(
     a: int,
     b: int,

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from planning.grid import FREE, LETHAL, UNKNOWN
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
+
+_FARTHER = 1.0 + 1e-6
+"""Squared distances are told apart by rounding to float32 when one is so many times the other."""
 
 
 class RiskLayers(NamedTuple):
@@ -78,29 +81,102 @@ def stamp_clearance(
     """
     height, width = lethal.shape
     reach = math.ceil(max_clearance_m / resolution_m) + 1
+    counts = lethal.copy()
+    # The least and, to know where rounding might decide, the second least squared distance.
+    first, second = np.full((height, width), np.inf), np.full((height, width), np.inf)
+    beside = np.empty(2 * reach + 1)
     for row in range(height):
         for column in range(width):
             if not lethal[row, column]:
                 continue
-            out_m[row, column] = 0.0
-            if (
-                0 < row < height - 1
-                and 0 < column < width - 1
-                and lethal[row - 1, column]
-                and lethal[row + 1, column]
-                and lethal[row, column - 1]
-                and lethal[row, column + 1]
-                and lethal[row - 1, column - 1]
-                and lethal[row - 1, column + 1]
-                and lethal[row + 1, column - 1]
-                and lethal[row + 1, column + 1]
-            ):
+            if _surrounded(lethal, row, column):
+                counts[row, column] = False
                 continue
             ox, oy = offset_x[row, column], offset_y[row, column]
+            low, high = max(0, column - reach), min(width, column + reach + 1)
+            for c in range(low, high):
+                dx = (c - column) * resolution_m - ox
+                beside[c - low] = dx * dx
             for r in range(max(0, row - reach), min(height, row + reach + 1)):
                 dy = (r - row) * resolution_m - oy
-                for c in range(max(0, column - reach), min(width, column + reach + 1)):
-                    dx = (c - column) * resolution_m - ox
-                    squared = dx * dx + dy * dy
-                    if squared < out_m[r, c] * out_m[r, c]:
-                        out_m[r, c] = math.sqrt(squared)
+                if dy * dy <= _FARTHER * max_clearance_m * max_clearance_m:
+                    _take_nearer(beside, high - low, dy * dy, r, low, first, second)
+    for row in range(height):
+        for column in range(width):
+            nearest = first[row, column]
+            if lethal[row, column]:
+                out_m[row, column] = 0.0
+            elif nearest > _FARTHER * max_clearance_m * max_clearance_m:
+                continue
+            elif (
+                second[row, column] > _FARTHER * nearest
+                and _FARTHER * nearest < max_clearance_m * max_clearance_m
+            ):
+                out_m[row, column] = math.sqrt(nearest)
+            else:
+                out_m[row, column] = _clearance_at(
+                    counts, offset_x, offset_y, resolution_m, reach, row, column, out_m[row, column]
+                )
+
+
+@njit_borrowing
+def _surrounded(lethal: NDArray[np.bool_], row: int, column: int) -> bool:
+    return (
+        0 < row < lethal.shape[0] - 1
+        and 0 < column < lethal.shape[1] - 1
+        and lethal[row - 1, column]
+        and lethal[row + 1, column]
+        and lethal[row, column - 1]
+        and lethal[row, column + 1]
+        and lethal[row - 1, column - 1]
+        and lethal[row - 1, column + 1]
+        and lethal[row + 1, column - 1]
+        and lethal[row + 1, column + 1]
+    )
+
+
+@njit_borrowing
+def _take_nearer(
+    beside: NDArray[np.float64],
+    count: int,
+    across: float,
+    row: int,
+    low: int,
+    first: NDArray[np.float64],
+    second: NDArray[np.float64],
+) -> None:
+    """In a row, from column `low` on: the two least different squared distances, those of one more point among them."""
+    r, left = (
+        np.uint64(row),
+        np.uint64(low),
+    )  # unsigned: no index counts from the end, several columns at a time
+    for c in range(np.uint64(count)):
+        squared, least = beside[c] + across, first[r, left + c]
+        greater = squared if squared > least else least
+        other = second[r, left + c]
+        second[r, left + c] = greater if (greater < other) & (squared != least) else other
+        first[r, left + c] = squared if squared < least else least
+
+
+@njit_borrowing
+def _clearance_at(
+    counts: NDArray[np.bool_],
+    offset_x: NDArray[np.float32],
+    offset_y: NDArray[np.float32],
+    resolution_m: float,
+    reach: int,
+    r: int,
+    c: int,
+    nearest_m: float,
+) -> float:
+    """The clearance of one cell, point by point in their order, where rounding decides between two that are as near."""
+    nearest = np.float32(nearest_m)
+    for row in range(max(0, r - reach), min(counts.shape[0], r + reach + 1)):
+        for column in range(max(0, c - reach), min(counts.shape[1], c + reach + 1)):
+            if counts[row, column]:
+                dx = (c - column) * resolution_m - offset_x[row, column]
+                dy = (r - row) * resolution_m - offset_y[row, column]
+                squared = dx * dx + dy * dy
+                if squared < nearest * nearest:
+                    nearest = np.float32(math.sqrt(squared))
+    return float(nearest)

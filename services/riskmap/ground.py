@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 from services.riskmap.cells import (
     BELOW,
     CEILING,
@@ -152,14 +152,15 @@ def walk(
                 continue
             r = sweep.low_distance[b, k]
             row, column = slot(rules, cells.shape[0], cells.shape[1], sweep.sensor[0] + r * dx, sweep.sensor[1] + r * dy)  # fmt: skip  # noqa: E501
-            known = False
+            known, mean = False, np.float32(0.0)
             if row >= 0:
-                cell = cells[row, column]
-                known = cell[SEEN] >= _TRUSTED_POINTS and cell[MEAN] > last_z - rules.height_m
+                mean = cells[row, column, MEAN]
+                known = cells[row, column, SEEN] >= _TRUSTED_POINTS and mean > last_z - rules.height_m
             gap = r - last_r
             if known:
-                gate = max(rules.step_m, 3.0 * math.sqrt(variance_now(cell, rules)))
-                is_ground = z <= cell[MEAN] + gate
+                drift = rules.drift_per_m * (rules.travelled_m - cells[row, column, TRAVELLED])
+                gate = max(rules.step_m, 3.0 * math.sqrt(cells[row, column, VARIANCE] + drift * drift))
+                is_ground = z <= mean + gate
             elif body[b, k]:
                 is_ground = z <= last_z + _FOOT_M + 0.1 * min(gap, 0.5)
             else:
@@ -171,7 +172,7 @@ def walk(
                 kind[b, k], ground[b, k] = GROUND, z
                 last_z, last_r = z, r
                 continue
-            ground[b, k] = min(cell[MEAN], z) if known else min(last_z, z)
+            ground[b, k] = min(mean, z) if known else min(last_z, z)
             kind[b, k] = ABOVE if z - ground[b, k] <= rules.height_m else OVERHEAD
             if kind[b, k] == ABOVE:
                 last_r = r
@@ -193,8 +194,9 @@ def fuse_ground(
     """
     height, width = cells.shape[0], cells.shape[1]
     lowest = np.full((height, width), np.inf, dtype=np.float32)
-    sums = np.zeros((height, width, 4), dtype=np.float32)
+    place = np.zeros((height, width), dtype=np.int32)  # of the cell among those touched, from 1 on
     count = sweep.points.shape[0]
+    sums = np.zeros((count + 1, 4), dtype=np.float32)
     rows, columns = np.full(count, -1, dtype=np.int32), np.zeros(count, dtype=np.int32)
     touched = np.empty((count, 2), dtype=np.int32)
     last = kind.shape[1] - 1
@@ -215,19 +217,21 @@ def fuse_ground(
             continue
         over = np.float32(sweep.sensor[2] + sweep.points[i, 2]) - lowest[r, c]
         if over <= rules.step_m:
-            if sums[r, c, 0] == 0.0:
+            t = place[r, c]
+            if t == 0:
                 touched[found, 0], touched[found, 1] = r, c
                 found += 1
-            sums[r, c, 0] += 1.0
-            sums[r, c, 1] += over
-            sums[r, c, 2] += over * over
-            sums[r, c, 3] = max(sums[r, c, 3], sweep.distance[i])
+                t = place[r, c] = found
+            sums[t, 0] += 1.0
+            sums[t, 1] += over
+            sums[t, 2] += over * over
+            sums[t, 3] = max(sums[t, 3], sweep.distance[i])
     for t in range(found):
         r, c = touched[t, 0], touched[t, 1]
-        n = sums[r, c, 0]
-        mean = sums[r, c, 1] / n
-        scatter = max(sums[r, c, 2] / n - mean * mean, 0.0)
-        attitude = rules.angle_sigma_rad * sums[r, c, 3]
+        n = sums[t + 1, 0]
+        mean = sums[t + 1, 1] / n
+        scatter = max(sums[t + 1, 2] / n - mean * mean, 0.0)
+        attitude = rules.angle_sigma_rad * sums[t + 1, 3]
         noise = attitude * attitude + (rules.range_sigma_m * rules.range_sigma_m + scatter) / n
         _fuse(cells[r, c], lowest[r, c] + mean, noise, n, rules)
 
@@ -283,7 +287,7 @@ def join_rings(
     """
     bins = kind.shape[1]
     distance, height = np.empty(bins + 1, dtype=np.float64), np.empty(bins + 1, dtype=np.float64)
-    clear = np.empty(bins + 1, dtype=np.bool_)
+    clear, anything = np.empty(bins + 1, dtype=np.bool_), np.empty(bins, dtype=np.uint8)
     sensor = (sweep.sensor[0], sweep.sensor[1], sweep.sensor[2])
     for b in range(BEARINGS):
         if sweep.start[b] == sweep.start[b + 1]:
@@ -292,9 +296,9 @@ def join_rings(
         dx, dy = math.cos(angle), math.sin(angle)
         distance[0], height[0], clear[0] = 0.0, rules.feet_m, False
         count, obstructed = 1, False
-        left, right = (b - 1) % BEARINGS, (b + 1) % BEARINGS
+        _join(kind, b, (b - 1) % BEARINGS, (b + 1) % BEARINGS, anything)
         for k in range(bins):
-            if kind[b, k] + kind[left, k] + kind[right, k] == NOTHING:
+            if anything[k] == NOTHING:
                 continue
             seen = _seen_from(kind, b, k)
             if seen < 0:
@@ -314,7 +318,15 @@ def join_rings(
             )
 
 
-@njit
+@njit_borrowing
+def _join(kind: NDArray[np.uint8], b: int, left: int, right: int, out: NDArray[np.uint8]) -> None:
+    """Where a bearing or its neighbours have anything: not `NOTHING`."""
+    here, before, after = np.uint64(b), np.uint64(left), np.uint64(right)  # unsigned: many bins at a time
+    for k in range(np.uint64(out.shape[0])):
+        out[k] = kind[here, k] | kind[before, k] | kind[after, k]
+
+
+@njit_borrowing
 def _seen_from(kind: NDArray[np.uint8], b: int, k: int) -> int:
     """Which of a bearing and its two neighbours has something at or below the robot's height in a bin; -1: none.
 

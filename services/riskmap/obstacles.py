@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 from services.riskmap.cells import (
     CEILING,
     CEILING_SEEN,
@@ -114,7 +114,9 @@ def clear_pierced(
             if cells[r, c, HIT_WEIGHT] > 0.0 and not done[r, c]:
                 off_x = (column + 0.5 - x0) * res + cells[r, c, HIT_X]
                 off_y = (row + 0.5 - y0) * res + cells[r, c, HIT_Y]
-                if _pierced(sweep, first, end, off_x, off_y, cells[r, c], res):
+                if _pierced(
+                    sweep, first, end, off_x, off_y, cells[r, c, HIT_LOW], cells[r, c, HIT_HIGH], res
+                ):
                     done[r, c] = True
                     speak_against(cells[r, c], rules)
             if next_x < next_y:
@@ -127,14 +129,15 @@ def clear_pierced(
                 row += 1 if dy > 0 else -1
 
 
-@njit
+@njit_borrowing
 def _pierced(
     sweep: Sweep,
     first: int,
     end: int,
     off_x: float,
     off_y: float,
-    cell: NDArray[np.float32],
+    hit_low: float,
+    hit_high: float,
     resolution_m: float,
 ) -> bool:
     """Whether one of the rays went through the mean hit, which is at (off_x, off_y) from the sensor."""
@@ -145,7 +148,7 @@ def _pierced(
         if along >= reach - 0.5 * resolution_m or abs(off_x * dy - off_y * dx) > _PIERCED_M:
             continue
         z = sweep.sensor[2] + sweep.points[i, 2] / reach * along
-        if cell[HIT_LOW] - _ABOVE_M <= z <= cell[HIT_HIGH] + _ABOVE_M:
+        if hit_low - _ABOVE_M <= z <= hit_high + _ABOVE_M:
             return True
     return False
 

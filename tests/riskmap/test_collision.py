@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import integrate, stats
@@ -114,3 +114,33 @@ def test_rho_along_a_wall_is_that_of_the_disc_that_overlaps_it(resolution_m: flo
         total = segment_risk(hazard, resolution_m, 0, 0, x, 1.0, x, 3.0)[1]
         exact = 2.0 * inside * _share_beyond(4.0 - x, 0.335)
         assert 1 - math.exp(-total) == pytest.approx(1 - math.exp(-exact), rel=tolerance, abs=1e-6)
+
+
+@settings(max_examples=30)
+@given(
+    seed=st.integers(0, 10_000),
+    share=st.sampled_from([0.01, 0.1, 0.6]),
+    spread_m=st.sampled_from([0.0, 0.05]),
+)
+def test_clearance_is_that_of_the_points_one_by_one_in_their_order(
+    seed: int, share: float, spread_m: float
+) -> None:
+    """Bit for bit, also where many points are equally near."""
+    rng = np.random.default_rng(seed)
+    lethal = rng.random((15, 18)) < share
+    x, y = (rng.uniform(-spread_m, spread_m, lethal.shape).astype(np.float32) for _ in range(2))
+    found, wanted = (np.full(lethal.shape, 0.7, dtype=np.float32) for _ in range(2))
+    stamp_clearance(lethal, x, y, 0.1, 0.7, found)
+    around = np.pad(lethal, 1)
+    inner = np.ones_like(lethal)
+    for r, c in np.ndindex(3, 3):
+        inner &= around[r : r + 15, c : c + 18]
+    for row, column in np.argwhere(lethal):
+        wanted[row, column] = 0.0
+        if inner[row, column]:
+            continue
+        for r, c in np.ndindex(*lethal.shape):
+            dx, dy = (c - column) * 0.1 - float(x[row, column]), (r - row) * 0.1 - float(y[row, column])
+            if dx * dx + dy * dy < float(wanted[r, c] * wanted[r, c]):
+                wanted[r, c] = math.sqrt(dx * dx + dy * dy)
+    assert np.array_equal(found, wanted)
