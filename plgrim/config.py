@@ -152,6 +152,8 @@ class Config(BaseSettings):
             section.setdefault("footprint_radius_m", PROFILES[self.profile].footprint_radius_m)
         if service == "riskmap" and rough:
             section.setdefault("model", "terrain")
+        elif service == "irm" and rough:
+            section = {**ROUGH_CRUMBS, **section}
         return section
 
 
@@ -164,6 +166,9 @@ def is_rough(sim: Mapping[str, Any]) -> bool:
 
 DOWNWARD_LIDAR = {"rings": 24, "elevation_min_deg": -45.0, "elevation_max_deg": 15.0}
 """For rough ground: with the default, no ring meets the ground nearer than 3 m, nor any way down at all."""
+
+ROUGH_CRUMBS = {"min_node_entropy": 0.2, "frontier_min_gain": 0.3}
+"""For irm on rough ground, where every stone leaves a corner that is hard to look into."""
 
 ROUGH_WORLDS = ("cave", "lava_tube", "short_lava_tube")
 """Built-in worlds whose ground is not flat."""

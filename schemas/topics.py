@@ -9,7 +9,15 @@ from schemas.contract import SECOND_NS, Topic
 from schemas.operation import JudgeReport, MissionCommand, MissionState, StageHealth, WorldPicture
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPolicy, Plan
 from schemas.sensing import CoverageScan, FollowerState, Odometry, PointCloud, PoseGraph, ReadyGrid
-from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest, LocalIrm, RiskMap
+from schemas.world import (
+    CoverageSummary,
+    CoverageWindow,
+    GlobalIrm,
+    GraphRequest,
+    LocalIrm,
+    MovingPoints,
+    RiskMap,
+)
 
 SERVICES = ("riskmap", "irm", "gcp", "lcp", "reconciler", "mission", "status", "sim")
 """The services, in the order in which lock-step runs those that are due at the same time."""
@@ -83,6 +91,9 @@ RISK_MAP: Topic[RiskMap] = _topic(
     RiskMap, "riskmap/risk_map", "irm reconciler status", "hazard rate, state and clearance around the robot",
     period_ms=200, stale_ms=1500, max_bytes=16 * _MIB, link=True,
 )  # fmt: skip
+MOVING: Topic[MovingPoints] = _topic(
+    MovingPoints, "riskmap/moving", "reconciler", "what moves in the newest cloud", period_ms=0, stale_ms=500,
+)  # fmt: skip
 LOCAL_IRM: Topic[LocalIrm] = _topic(
     LocalIrm, "irm/local_irm", "lcp reconciler status", "the Local IRM", period_ms=500, keep_all=True, stale_ms=3000,
     max_bytes=4 * _MIB, link=True,
@@ -136,7 +147,7 @@ COMMAND: Topic[MissionCommand] = _topic(
 )  # fmt: skip
 
 TOPICS: tuple[Topic[Message], ...] = (
-    CLOUD, READY_GRID, ODOMETRY, POSE_GRAPH, COVERAGE_SCAN, FOLLOWER, JUDGE, WORLD_PICTURE, RISK_MAP, LOCAL_IRM,
+    CLOUD, READY_GRID, ODOMETRY, POSE_GRAPH, COVERAGE_SCAN, FOLLOWER, JUDGE, WORLD_PICTURE, RISK_MAP, MOVING, LOCAL_IRM,
     GLOBAL_IRM, COVERAGE, COVERAGE_WINDOW, GLOBAL_POLICY, GCP_GRAPH_REQUEST, MISSION_GRAPH_REQUEST,
     STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, MISSION, COMMAND,
 )  # fmt: skip

@@ -43,6 +43,14 @@ class RiskMap(Message):
     top_m: Annotated[Array, column("float32", "top_h", "top_w")]
 
 
+class MovingPoints(Message):
+    """What moves in the newest cloud: points_m (n, 2) in `odom`, on the surface of what has come into free ground."""
+
+    schema_name: ClassVar[str] = "moving_points"
+
+    points_m: Annotated[Array, column("float32", "n", 2)]
+
+
 class LocalIrm(Message):
     """The Local IRM: a rolling lattice of nodes snapped to multiples of the spacing, in `odom`.
 

@@ -26,7 +26,7 @@ from plgrim.commands.options import (
 if TYPE_CHECKING:
     from plgrim.config import Config
 
-_DEMO_WORLD = "subway_1x"
+_DEMO_WORLD = "short_lava_tube"
 
 
 def demo(

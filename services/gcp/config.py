@@ -35,7 +35,9 @@ class Config(BaseModel):
         description="or less than this, nats, is a crumb. It gives way to what is better by",
     )
     crumb_margin: float = Field(2.0, ge=0, le=1000, description="this, nats, and less than half as far")
-    crumb_times: float = Field(8.0, ge=1, le=1e6, description="or promises so many times as much.")
+    crumb_times: float = Field(
+        8.0, ge=1, le=1e6, description="or promises so many times as much, and is less than twice as far."
+    )
     same_target_m: float = Field(
         2.0, gt=0, le=20, description="A frontier so near to the target's place is the same target, m."
     )

@@ -155,34 +155,21 @@ def _lower(edges: Edges, state: State, floor: float, node: int, size: int) -> in
 
 
 @njit
-def _settled(state: State, wanted: Slots, size: int) -> bool:
-    """Whether nothing in the queue can change the value of a wanted node."""
-    if size == 0:
-        return True
-    for k in range(wanted.shape[0]):
-        node = wanted[k]
-        if state.place[node] >= 0 or -state.value[node] > state.key[state.heap[0]]:
-            return False
-    return True
-
-
-@njit
 def _settle(edges: Edges, state: State, floor: float, wanted: Slots, size: int) -> tuple[int, int]:
-    """Make the values of the wanted nodes true; (size of the queue, how many nodes were gone through)."""
-    steps = 0
-    hard = 0
+    """Make the values of the wanted nodes true; (size of the queue, how many nodes were gone through).
+
+    Keys come out of the queue in ascending order, and what a node does to others has a larger key: the first of the
+    wanted nodes, once it is consistent and before the rest of the queue, stays as it is.
+    """
+    steps, done = 0, 0
     while size > 0:
-        if hard < wanted.shape[0]:
-            # The wanted node that was not settled last time is asked first: all are asked only when it is.
-            node = wanted[hard]
-            if state.place[node] < 0 and -state.value[node] <= state.key[state.heap[0]]:
-                hard += 1
-                continue
-        elif _settled(state, wanted, size):
+        while done < wanted.shape[0]:
+            node = wanted[done]
+            if state.place[node] >= 0 or -state.value[node] > state.key[state.heap[0]]:
+                break
+            done += 1
+        if done == wanted.shape[0]:
             break
-        else:
-            hard = 0
-            continue
         node = state.heap[0]
         steps += 1
         if state.told[node] > state.value[node]:

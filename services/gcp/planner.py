@@ -22,7 +22,7 @@ from services.gcp.roadnet import RoadNet
 Floats = NDArray[np.float64]
 Slots = NDArray[np.int32]
 
-_KEPT_FIELDS = 12
+_KEPT_FIELDS = 8
 """Frontiers whose fields are kept: those weighed now, and some that were and may be again."""
 
 

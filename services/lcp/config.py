@@ -28,9 +28,9 @@ class Config(BaseModel):
     value_rollouts: int = Field(64, ge=1, le=10_000, description="Rollouts for the value without planning.")
     min_visits: int = Field(12, ge=1, le=100_000, description="Tree nodes with fewer visits are not policy.")
     cover_begin_entropy: float = Field(
-        0.7, ge=0, le=100, description="So much in reach starts covering, nats."
+        1.5, ge=0, le=100, description="So much in reach starts covering, nats."
     )
-    cover_end_entropy: float = Field(0.1, ge=0, le=100, description="Less in reach ends covering, nats.")
+    cover_end_entropy: float = Field(0.3, ge=0, le=100, description="Less in reach ends covering, nats.")
     cover_min_value: float = Field(
         0.4, ge=0, le=100, description="A policy worth less gives way to the target."
     )

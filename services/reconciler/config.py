@@ -59,6 +59,15 @@ class Config(BaseModel):
     degraded_speed_share: float = Field(
         0.5, gt=0, le=1, description="Share of the speed limits when degraded."
     )
+    separation_margin_m: float = Field(
+        0.15, ge=0, le=2, description="Kept between the robot's disc and what moves, m."
+    )
+    mover_speed_mps: float = Field(
+        0.8, ge=0, le=3, description="What moves is taken to be no faster, m/s; ISO 13855 has 1.6 for people."
+    )
+    reaction_s: float = Field(
+        0.4, ge=0, le=5, description="From a cloud to the robot's braking because of it, at most, s."
+    )
     off_path_m: float = Field(0.6, gt=0.05, le=5, description="Farther off its path the robot plans anew, m.")
     blocked_s: float = Field(
         1.0, gt=0, le=60, description="Blocked or stuck so long, the path is dropped, s."

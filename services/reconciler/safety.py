@@ -20,13 +20,17 @@ class SafetyLimits(NamedTuple):
 
 
 class SafetyInputs(NamedTuple):
-    """What the machine looks at: ages of inputs in seconds (None: never came), and the mission's phase."""
+    """What the machine looks at: ages of inputs in seconds (None: never came), and the mission's phase.
+
+    in_the_way: somebody moves so near that the robot must stand (see `separation`).
+    """
 
     risk_age_s: float | None
     odometry_age_s: float | None
     irm_age_s: float | None
     policy_silence_s: float
     phase: MissionPhase | None
+    in_the_way: bool = False
 
 
 class Verdict(NamedTuple):
@@ -44,6 +48,8 @@ def judge(limits: SafetyLimits, inputs: SafetyInputs) -> Verdict:
     DONE and HOLD stop the robot. RETURN moves, unless something also asks for a hold.
     """
     asked = [*_stale(limits, inputs), *_mission(inputs.phase)]
+    if inputs.in_the_way:
+        asked.append((SafetyState.HOLD, "somebody moves in the way"))
     if not asked:
         return Verdict(SafetyState.RUN, "", True, False)
     state, reason = max(asked, key=lambda entry: _SEVERITY.index(entry[0]))

@@ -57,6 +57,20 @@ class Config(BaseModel):
     free_log_odds: float = Field(
         0.4, gt=0, le=10, description="A cell is free below minus this (flat model)."
     )
+    # what moves (flat model)
+    settle_s: float = Field(
+        1.5, gt=0, le=60, description="What stands in free ground for longer no longer counts as moving, s."
+    )
+    moving_range_m: float = Field(
+        8.0, ge=0, le=50, description="Moving things are looked for up to this range, m; 0: not at all."
+    )
+    # where ground is missing (flat model)
+    void_range_m: float = Field(
+        3.0,
+        ge=0,
+        le=20,
+        description="Where a direction that shows ground shows none, unknown cells up to here are a drop, m; 0: off.",
+    )
     # ground (terrain model)
     range_sigma_m: float = Field(0.015, gt=0, le=0.5, description="Deviation of a point's height, m.")
     angle_sigma_rad: float = Field(

@@ -21,6 +21,7 @@ class OccupancyWindow:
     """Log-odds of each cell being an obstacle, and where in the cell it was hit.
 
     log_odds: (h, w). hit_weight, hit_x, hit_y: (h, w) sums for the mean hit as an offset from the cell's centre, m.
+    trust_s: (h, w), see `moving.update_trust`.
     """
 
     def __init__(self, size_m: float, resolution_m: float) -> None:
@@ -33,20 +34,24 @@ class OccupancyWindow:
         self.hit_weight = np.zeros(self.spec.shape, dtype=np.float32)
         self.hit_x = np.zeros(self.spec.shape, dtype=np.float32)
         self.hit_y = np.zeros(self.spec.shape, dtype=np.float32)
+        self.trust_s = np.zeros(self.spec.shape, dtype=np.float32)
+
+    @property
+    def layers(self) -> tuple[NDArray[np.float32], ...]:
+        """All layers, for whoever keeps or moves them."""
+        return self.log_odds, self.hit_weight, self.hit_x, self.hit_y, self.trust_s
 
     def roll_to(self, x_m: float, y_m: float) -> None:
         """Centre the window on a point; what leaves it is forgotten, what stays is not resampled."""
         wanted = window_around(x_m, y_m, self._size_m, self.spec.resolution_m)
         if wanted == self.spec:
             return
-        old_spec, old = self.spec, (self.log_odds, self.hit_weight, self.hit_x, self.hit_y)
+        old_spec, old = self.spec, self.layers
         self.spec = wanted
         self._allocate()
         common = overlap(old_spec, wanted)
         if common is not None:
-            for before, now in zip(
-                old, (self.log_odds, self.hit_weight, self.hit_x, self.hit_y), strict=True
-            ):
+            for before, now in zip(old, self.layers, strict=True):
                 now[common[1]] = before[common[0]]
 
 

@@ -12,8 +12,8 @@ from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.sensing import Odometry, PointCloud, ReadyGrid
 from schemas.snapshot import pack_snapshot, unpack_snapshot
-from schemas.topics import CLOUD, FOLLOWER, ODOMETRY, READY_GRID, RISK_MAP
-from schemas.world import GridHeader, RiskMap
+from schemas.topics import CLOUD, FOLLOWER, MOVING, ODOMETRY, READY_GRID, RISK_MAP
+from schemas.world import GridHeader, MovingPoints, RiskMap
 from services.riskmap.bumps import Bumps, stamp_bumps
 from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
@@ -72,6 +72,11 @@ class Model(Protocol):
         """Go on from `state`."""
         ...
 
+    @property
+    def moving_m(self) -> NDArray[np.float32]:
+        """What moves in the newest sweep, (m, 2) m in odom."""
+        ...
+
 
 class RiskMapStage:
     """Integrates clouds as they come and publishes the risk map at its own period.
@@ -103,24 +108,30 @@ class RiskMapStage:
             blocked = follower is not None and follower.blocked
             self._bumps.observe(now, self._pose, odometry.message.speed_mps, blocked)
         self._drop_old_grid(now)
+        found: Outputs = []
         for received in inputs.new(CLOUD):
             if received.age_ns <= self._config.cloud_timeout_s * SECOND_NS and self._timely(
                 now, received.message
             ):
-                self._news |= self._integrate(received.message)
+                taken = self._integrate(received.message)
+                self._news |= taken
+                if taken:
+                    found.append(
+                        Output(MOVING, MovingPoints(stamp_ns=self._stamp_ns, points_m=self._model.moving_m))
+                    )
         for grid in inputs.new(READY_GRID):
             if self._timely(now, grid.message):
                 self._take_grid(grid.message)
         standing = not self._news and self._grid is not None
         due = now - self._published_ns >= self._config.publish_period_s * SECOND_NS - SECOND_NS // 100
         if not due or not (self._news or standing):
-            return []
+            return found
         stamp_ns = max(self._stamp_ns, 0)
         if standing:
             self._roll_to(self._pose)
             stamp_ns = max(stamp_ns, _stamp(odometry.message if odometry is not None else None, now))
         self._published_ns, self._news = now, False
-        return [Output(RISK_MAP, self._risk_map(now, stamp_ns))]
+        return [*found, Output(RISK_MAP, self._risk_map(now, stamp_ns))]
 
     def _timely(self, now: Stamp, message: PointCloud | ReadyGrid) -> bool:
         """Whether a message may be from now; counts it otherwise."""

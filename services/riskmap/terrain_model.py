@@ -53,6 +53,11 @@ class TerrainModel:
         """Where the window lies."""
         return self._window.spec
 
+    @property
+    def moving_m(self) -> NDArray[np.float32]:
+        """What moves in the newest sweep, (m, 2): not known on rough ground, where old hits only fade."""
+        return np.zeros((0, 2), dtype=np.float32)
+
     def roll_to(self, x_m: float, y_m: float) -> bool:
         """Centre the window on a point. Returns whether it moved."""
         return self._window.roll_to(x_m, y_m)
