@@ -81,7 +81,7 @@ class Driven:
                 self.why = f"hazard {(hazard - self.at) * STEP_M:.1f} m ahead"
 
     def _needed_m(self, ground: Ground, here: NDArray[np.float64]) -> float:
-        """Clearance that the path has to keep. Where the robot has not even that, it must get away: what it has, then."""
+        """Clearance that the path has to keep; where the robot has not even that, what it has: it must get away."""
         c, s = self._config, ground.spec
         has_m = clearance_at(ground.clearance_m, s.resolution_m, s.ix0, s.iy0, float(here[0]), float(here[1]))
         least_m = c.footprint_radius_m - 0.05
