@@ -148,12 +148,13 @@ class Config(BaseSettings):
                 section["lidar"] = {**DOWNWARD_LIDAR, **section.get("lidar", {})}
         elif service == "riskmap" and other:
             section.setdefault("profile", self.profile)
-        elif service == "reconciler" and other:
-            section.setdefault("footprint_radius_m", PROFILES[self.profile].footprint_radius_m)
+        elif service == "reconciler":
+            section = {"footprint_radius_m": PROFILES[self.profile].footprint_radius_m, **section}
+            section.setdefault("clearance_margin_m", ROUGH_MARGIN_M if rough else 0.0)
         if service == "riskmap" and rough:
             section.setdefault("model", "terrain")
         elif service == "irm" and rough:
-            section = {**ROUGH_CRUMBS, **section}
+            section = {"clearance_margin_m": ROUGH_MARGIN_M, **ROUGH_CRUMBS, **section}
         return section
 
 
@@ -166,6 +167,9 @@ def is_rough(sim: Mapping[str, Any]) -> bool:
 
 DOWNWARD_LIDAR = {"rings": 24, "elevation_min_deg": -45.0, "elevation_max_deg": 15.0}
 """For rough ground: with the default, no ring meets the ground nearer than 3 m, nor any way down at all."""
+
+ROUGH_MARGIN_M = 0.1
+"""Beside a stone, a foot that is so far off its place tips the robot; on flat ground a wall only stops it."""
 
 ROUGH_CRUMBS = {"min_node_entropy": 0.2, "frontier_min_gain": 0.3}
 """For irm on rough ground, where every stone leaves a corner that is hard to look into."""

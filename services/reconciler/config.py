@@ -43,6 +43,9 @@ class Config(BaseModel):
     max_acceleration_mps2: float = Field(0.8, gt=0, le=10, description="Speeding up and braking, m/s2.")
     max_turn_rate_radps: float = Field(1.2, gt=0, le=10, description="Turn rate, rad/s.")
     footprint_radius_m: float = Field(0.25, gt=0.05, le=2, description="The robot's disc, m.")
+    clearance_margin_m: float = Field(
+        0.0, ge=0, le=1, description="Paths keep so much more off obstacles, m."
+    )
     tight_clearance_m: float = Field(0.3, gt=0, le=2, description="Up to here the slowest speed, m.")
     free_clearance_m: float = Field(0.6, gt=0, le=5, description="From here on no slowing down, m.")
     comfort_clearance_m: float = Field(

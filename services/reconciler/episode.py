@@ -185,6 +185,19 @@ def line_to_lattice(
     row, column = s.cell_of(odometry.pose.x_m, odometry.pose.y_m)
     if not s.contains(row, column):
         return None
+    # A robot that stands in a tight place has to get out of it.
+    for share in (1.0, 0.7, 0.4, 0.0):
+        found = _nearest_node(irm, ground, odometry, share * needed_m, avoid, row, column)
+        if found is not None:
+            return found
+    return None
+
+
+def _nearest_node(
+    irm: LocalIrm, ground: Ground, odometry: Odometry, needed_m: float, avoid: set[int], row: int, column: int
+) -> tuple[int, NDArray[np.float64]] | None:
+    """As `line_to_lattice`, over ground of this clearance."""
+    s = ground.spec
     passable = (ground.state == 1) & (ground.clearance_m >= needed_m)
     cost = np.full(s.shape, np.inf)
     parent = np.full(s.shape, -1, np.int32)

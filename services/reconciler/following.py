@@ -13,7 +13,7 @@ from schemas.policy import LocalPolicy
 from schemas.sensing import FollowerState, Odometry
 from services.reconciler.config import Config
 from services.reconciler.episode import Committed, Opened
-from services.reconciler.path import STEP_M, Ground, first_hazard, project, resample, smooth
+from services.reconciler.path import STEP_M, Ground, clearance_at, first_hazard, project, resample, smooth
 from services.reconciler.trail import Trail
 
 _KEPT = ("at", "end", "changed", "why", "trouble_ns", "backing_ns")
@@ -72,13 +72,20 @@ class Driven:
         s, points = ground.spec, self.committed.points
         hazard = first_hazard(
             points, self.at + 2, ground.state, ground.clearance_m, s.resolution_m, s.ix0, s.iy0,
-            self._config.footprint_radius_m - 0.05,
+            self._needed_m(ground, points[self.at]),
         )  # fmt: skip
         end = len(points) - 1 if hazard < 0 else max(hazard - 3, self.at)
         if end != self.end:
             self.end, self.changed = end, True
             if hazard >= 0:
                 self.why = f"hazard {(hazard - self.at) * STEP_M:.1f} m ahead"
+
+    def _needed_m(self, ground: Ground, here: NDArray[np.float64]) -> float:
+        """Clearance that the path has to keep; where the robot has not even that, what it has: it must get away."""
+        c, s = self._config, ground.spec
+        has_m = clearance_at(ground.clearance_m, s.resolution_m, s.ix0, s.iy0, float(here[0]), float(here[1]))
+        least_m = c.footprint_radius_m - 0.05
+        return max(least_m, min(least_m + c.clearance_margin_m, has_m - 0.02))
 
     def follow(self, now: Stamp, odometry: Odometry, follower: FollowerState | None, plan_id: int) -> bool:
         """Where the robot is on its path. Returns whether the path was dropped: left, or no way on along it.

@@ -69,7 +69,7 @@ def smooth(
         )  # fmt: skip
         relax(
             piece, ground.clearance_m, s.resolution_m, s.ix0, s.iy0, config.comfort_clearance_m, 40,
-            config.footprint_radius_m,
+            config.footprint_radius_m + config.clearance_margin_m,
         )  # fmt: skip
         pieces.append(piece if not pieces else piece[1:])
     line = np.concatenate(pieces) if pieces else rest[:1]

@@ -225,7 +225,8 @@ class ReconcilerStage:
         self, now: Stamp, irm: LocalIrm, odometry: Odometry, ground: Ground
     ) -> tuple[Opened, EpisodeRequest] | None:
         """Junction at the nearest node: nothing is kept but the way to it."""
-        found = line_to_lattice(irm, ground, odometry, self._config.footprint_radius_m - 0.03, set())
+        needed_m = self._config.footprint_radius_m + self._config.clearance_margin_m - 0.03
+        found = line_to_lattice(irm, ground, odometry, needed_m, set())
         if found is None:
             return None
         node, line = found

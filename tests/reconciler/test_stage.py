@@ -490,3 +490,20 @@ def test_unknown_keys_are_refused_at_every_level() -> None:
     for bad in ({"max_kept": 3}, {"weights": {"k_riks": 1.0}}):
         with pytest.raises(ValueError, match="Extra inputs"):
             Config.model_validate(bad)
+
+
+def test_paths_keep_their_margin_and_a_robot_in_a_tight_place_gets_out_of_it() -> None:
+    rig = Rig(config=FEW.model_copy(update={"clearance_margin_m": 0.1}))
+    rig.run(3.0)
+    assert rig.last().valid
+    line = rig.last()
+    rig.wall_at(float(line.x_m[25]) + 0.45, float(line.y_m[25]), 0.1)
+    rig.run(0.4)
+    clear = [
+        rig.clearance_at(float(x), float(y)) for x, y in zip(rig.last().x_m, rig.last().y_m, strict=True)
+    ]
+    assert min(clear[2:]) >= FEW.footprint_radius_m + 0.1 - 0.05 - 1e-6
+    rig.moving = False
+    rig.wall_at(rig.x_m - 0.36, rig.y_m, 0.1)  # 0.26 m of clearance: less than is kept, more than it needs
+    rig.run(2.5)
+    assert rig.last().valid and len(rig.last().x_m) > 10
