@@ -99,8 +99,8 @@ def test_a_look_covers_the_free_ground_in_range_field_of_view_and_sight(
     assert not (sure & (seen == 0)).any()
     free = state == FREE
     assert not (free & (seen > 0) & ~maybe).any()
-    surface = ndimage.binary_dilation(free & (seen > 0), np.ones((3, 3))) & (state == LETHAL)
-    behind = ndimage.binary_dilation(surface, np.ones((3, 3))) & ~free
+    surface = ndimage.binary_dilation(free & (seen > 0), np.ones((3, 3), np.bool_)) & (state == LETHAL)
+    behind = ndimage.binary_dilation(surface, np.ones((3, 3), np.bool_)) & ~free
     assert np.array_equal((seen > 0) & ~free, surface | behind)
     assert np.allclose(seen[seen > 0], LOOK)
     assert new == int((layer.read(WIDE) > 0).sum()) == int((seen > 0).sum())
