@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from planning.coverage import look_log_odds
 from planning.frames import Planar
-from planning.grid import FREE, GridSpec, overlap
+from planning.grid import FREE, LETHAL, GridSpec, overlap
 from planning.rays import visible_cells
 from planning.sight import visible_over
 from schemas.sensing import CoverageScan
@@ -232,7 +232,26 @@ def _look(
             relief.top_m[r0:r1, c0:c1], relief.ground_m[r0:r1, c0:c1], free, (x_cells, y_cells, pose.z_m), reach_cells,
             pose.yaw_rad, scan.fov_rad, over,
         )  # fmt: skip
-        return patch, over
+        return patch, over | _behind(over, piece)
     out = np.zeros(patch.shape, dtype=np.uint8)
     visible_cells(piece != FREE, x_cells, y_cells, reach_cells, pose.yaw_rad, scan.fov_rad, out)
-    return patch, (out != 0) & free
+    seen = (out != 0) & free
+    return patch, seen | _behind(seen, piece)
+
+
+def _behind(seen: NDArray[np.bool_], state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """The obstacles that the sight ends at, and what is not free right behind their surface.
+
+    A wall was looked at to its foot. Where it stands is known to a cell or two only, and less where odometry drifts:
+    should it turn out to stand farther back, the ground before it is not unseen.
+    """
+    surface = _grown(seen) & (state == LETHAL)
+    return surface | (_grown(surface) & (state != FREE))
+
+
+def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The cells of a mask and the eight around each."""
+    padded = np.pad(mask, 1)
+    rows = padded[:-2] | padded[1:-1] | padded[2:]
+    grown: NDArray[np.bool_] = rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
+    return grown

@@ -39,6 +39,7 @@ from services.irm.footprints import FootprintStore
 from services.irm.ground import GroundStore
 from services.irm.keyframes import Anchor, Keyframes, OdomInMap, is_near
 from services.irm.local_irm import LocalIrmBuilder
+from services.irm.out_of_reach import TOO_NARROW, OutOfReach
 from services.irm.resample import moved
 from services.irm.roadmap import Roadmap
 from services.irm.tiles import TileLayer
@@ -86,6 +87,7 @@ class IrmStage:
         self._areas: Areas | None = None
         self._local: LocalIrmBuilder | None = None
         self._roadmap = Roadmap(config)
+        self._out_of_reach = OutOfReach(config.spacing_m)
         self._keyframes = Keyframes()
         self._odom = OdomInMap()
         self._doubtful: frozenset[int] = frozenset()
@@ -149,6 +151,7 @@ class IrmStage:
         before_m2 = self._areas.update()[1] if self._areas else 0.0
         self._odom.follow(motion)
         self._roadmap.follow(changed)
+        self._out_of_reach.follow(changed)
         if self._store is not None and self._ground_store is not None:
             self._store.follow(changed)
             self._ground_store.follow(changed)
@@ -235,7 +238,9 @@ class IrmStage:
         self._global_ns = now
         place = self._place(odometry)
         anchor = self._keyframes.reference(place.x_m, place.y_m)
-        assert self._areas is not None
+        assert self._areas is not None and self._local is not None
+        radius_m = self._local.footprint_radius_m
+        self._out_of_reach.update(window, radius_m + self._config.clearance_margin_m, radius_m, anchor)
         ground_m2, covered_m2 = self._areas.update()
         if covered_m2 >= self._covered_m2 + _PROGRESS_M2:
             self._covered_m2 = covered_m2
@@ -259,7 +264,8 @@ class IrmStage:
         return told.model_copy(update={"x_m": frame.x_m, "y_m": frame.y_m, "yaw_rad": frame.yaw_rad})
 
     def _summary(self, now: Stamp, reachable: float, covered: float) -> CoverageSummary:
-        given_up = self._roadmap.manager.given_up
+        given_up = [(g.x_m, g.y_m, g.gain, g.reason) for g in self._roadmap.manager.given_up]
+        given_up += [(p.x_m, p.y_m, p.gain, TOO_NARROW) for p in self._out_of_reach.places]
         frontiers = self._roadmap.manager.frontiers
         return CoverageSummary(
             stamp_ns=now,
@@ -272,9 +278,9 @@ class IrmStage:
             frontier_gain=float(sum(f.gain for f in frontiers.values())),
             breadcrumbs=self._roadmap.breadcrumbs(),
             settled=not frontiers and reachable > 0.0,
-            unreachable_xy_m=np.array([(g.x_m, g.y_m) for g in given_up], dtype=np.float64).reshape(-1, 2),
-            unreachable_gain=np.array([g.gain for g in given_up], dtype=np.float64),
-            unreachable_reason=[g.reason for g in given_up],
+            unreachable_xy_m=np.array([place[:2] for place in given_up], dtype=np.float64).reshape(-1, 2),
+            unreachable_gain=np.array([place[2] for place in given_up], dtype=np.float64),
+            unreachable_reason=[place[3] for place in given_up],
         )
 
     def snapshot(self) -> bytes:
@@ -283,6 +289,7 @@ class IrmStage:
             "roadmap": self._roadmap.state(),
             "keyframes": self._keyframes.state(),
             "odom": self._odom.state(),
+            "out_of_reach": self._out_of_reach.state(),
             "penalties": self._penalties,
             "pending": [scan.model_dump() for scan in self._pending],
             "anchors": self._local.state() if self._local else [],
@@ -304,6 +311,7 @@ class IrmStage:
         self._roadmap.set_state(state["roadmap"])
         self._keyframes.set_state(state["keyframes"])
         self._odom.set_state(state["odom"])
+        self._out_of_reach.set_state(state["out_of_reach"])
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
         self._pending = [CoverageScan(**scan) for scan in state["pending"]]
         self._global_ns = state["global_ns"]
@@ -330,6 +338,7 @@ class IrmStage:
             "ground": self._ground_store.take_changes(),
             "keyframes": self._keyframes.take_changes(),
             "odom": self._odom.state(),
+            "out_of_reach": self._out_of_reach.state(),
             "resolution": self._ground.resolution_m,
             "radius": self._local.footprint_radius_m,
             "version": self._local.version,
@@ -351,6 +360,7 @@ class IrmStage:
         self._ground_store.apply_changes(state["ground"])
         self._keyframes.apply_changes(state["keyframes"])
         self._odom.set_state(state["odom"])
+        self._out_of_reach.set_state(state["out_of_reach"])
         self._local.version = state["version"]
         self._global_ns, self._covered_m2 = state["global_ns"], state["covered_m2"]
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]

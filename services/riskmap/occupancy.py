@@ -16,6 +16,9 @@ _BEARINGS = 900
 _PIERCED_M = 0.02
 """A ray speaks against a surface that it passes at this distance or nearer, m."""
 
+_MOST_SKIMMED_M = 1.5
+"""Longest stretch before its end over which a ray clears no surface, m: more would leave ghosts before walls."""
+
 
 class OccupancyWindow:
     """Log-odds of each cell being an obstacle, and where in the cell it was hit.
@@ -151,7 +154,8 @@ def _clear_passed(
 
     Between two bearings the shorter of both counts too, so that far away no cell is missed between the rays. A cell
     that was hit before is cleared only by a ray through its mean hit: a ray that grazes a wall runs through many of
-    the wall's cells in front of its surface, and would wipe the wall out behind the robot.
+    the wall's cells in front of its surface, and would wipe the wall out behind the robot. Nor does it clear the
+    stretch right before its end, where it comes as near as that to the surface on which it ends.
     """
     height, width = log_odds.shape
     passed = hit_now
@@ -166,6 +170,7 @@ def _clear_passed(
         length = reach / resolution_m - 0.5
         if length <= 0.0:
             continue
+        skims = length - _skimmed(free_range, half // 2) / resolution_m
         dx, dy = math.cos(angle), math.sin(angle)
         column, row = math.floor(x0), math.floor(y0)
         step_x, step_y = (1 if dx > 0 else -1), (1 if dy > 0 else -1)
@@ -175,8 +180,8 @@ def _clear_passed(
         while travelled < length and 0 <= row < height and 0 <= column < width:
             off_x = column + 0.5 + hit_x[row, column] / resolution_m - x0
             off_y = row + 0.5 + hit_y[row, column] / resolution_m - y0
-            pierced = (
-                hit_weight[row, column] == 0.0 or abs(off_x * dy - off_y * dx) * resolution_m <= _PIERCED_M
+            pierced = hit_weight[row, column] == 0.0 or (
+                abs(off_x * dy - off_y * dx) * resolution_m <= _PIERCED_M and off_x * dx + off_y * dy < skims
             )
             if passed[row, column] == 0 and pierced:
                 passed[row, column] = 2
@@ -191,3 +196,18 @@ def _clear_passed(
                 travelled = next_y
                 next_y += abs(1.0 / dy)
                 row += step_y
+
+
+@njit
+def _skimmed(free_range: NDArray[np.float64], bearing: int) -> float:
+    """How far before its end a ray may be within `_PIERCED_M` of the surface it ends on, by its neighbours' ends, m.
+
+    Their ranges tell the angle at which it meets the surface: steep (two alike) or grazing (far apart).
+    """
+    count, reach = free_range.shape[0], free_range[bearing]
+    change = 0.0
+    for beside in (bearing - 1, (bearing + 1) % count):
+        if free_range[beside] > 0.0:
+            change = max(change, abs(free_range[beside] - reach))
+    slope = change / max(reach * 2.0 * math.pi / count, 1e-6)
+    return min(2.0 * _PIERCED_M * slope, _MOST_SKIMMED_M)

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from planning.coverage import look_log_odds, probability
 from planning.frames import Planar
@@ -97,9 +98,25 @@ def test_a_look_covers_the_free_ground_in_range_field_of_view_and_sight(
     seen = layer.read(spec)
     sure, maybe = _brute_look(state, spec, pose, range_m, fov_rad)
     assert not (sure & (seen == 0)).any()
-    assert not ((seen > 0) & ~maybe).any()
+    free = state == FREE
+    assert not (free & (seen > 0) & ~maybe).any()
+    surface = ndimage.binary_dilation(free & (seen > 0), np.ones((3, 3), np.bool_)) & (state == LETHAL)
+    behind = ndimage.binary_dilation(surface, np.ones((3, 3), np.bool_)) & ~free
+    assert np.array_equal((seen > 0) & ~free, surface | behind)
     assert np.allclose(seen[seen > 0], LOOK)
     assert new == int((layer.read(WIDE) > 0).sum()) == int((seen > 0).sum())
+
+
+def test_a_wall_that_turns_out_to_stand_farther_back_leaves_nothing_unseen_before_it() -> None:
+    """Drifting odometry moves walls by a cell or two after they were looked at."""
+    state = np.full((21, 21), FREE, np.uint8)
+    state[:, 15:] = UNKNOWN
+    state[:, 15] = LETHAL
+    spec = GridSpec(RES, 0, 0, 21, 21)
+    layer, store = layer_and_store()
+    store.add(scan_at(Planar(2.1, 2.1, 0.0), range_m=4.0), ORIGIN, state, spec, ORIGIN)
+    assert (layer.read(spec)[5:16, 10:17] > 0).all()
+    assert not (layer.read(spec)[:, 17:] > 0).any()
 
 
 @given(seed=st.integers(0, 10_000), looks=st.integers(2, 5))

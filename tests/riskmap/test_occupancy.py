@@ -263,6 +263,26 @@ def test_rays_that_graze_a_wall_do_not_wipe_it_out() -> None:
     assert (state[row, column : column + 100] == 1).all()
 
 
+def test_a_robot_that_stands_beside_a_wall_and_looks_along_it_does_not_wipe_it_out() -> None:
+    """Far along a wall the rays lie farther apart than its cells, and skim more of them than they hit."""
+    walls = rectangle(-12.0, -0.63, 12.0, 8.0)
+    rng = np.random.default_rng(0)
+    window = OccupancyWindow(30.0, 0.1)
+    row, column = window.spec.cell_of(-9.95, -0.63)
+    for k in range(260):
+        x = -10.0 + 0.25 * k if k < 40 else 0.0
+        yaw, (dx, dy, turned) = 0.1 * math.sin(0.05 * k), rng.normal(0.0, [0.01, 0.01, 0.002])
+        cloud = sweep(walls, Pose(x_m=x, z_m=SENSOR_Z_M, yaw_rad=yaw))
+        integrate(window, cloud, x + dx, dy, yaw + turned)
+        if k == 40:
+            before = (layers_of(window).state[row - 1 : row + 2, column : column + 200] == 2).any(axis=0)
+    after = (layers_of(window).state[row - 1 : row + 2, column : column + 200] == 2).any(axis=0)
+    assert before.mean() > 0.9
+    assert after[before].mean() > 0.97
+    gaps = "".join("x" if cell else " " for cell in after[:-20]).split("x")
+    assert max(len(gap) for gap in gaps) < 3
+
+
 def test_evidence_is_bounded() -> None:
     window = OccupancyWindow(6.0, 0.1)
     for _ in range(30):
