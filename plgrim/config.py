@@ -136,7 +136,8 @@ class Config(BaseSettings):
     def options(self, service: str) -> dict[str, Any]:
         """The section of a service, with what is said once for all: seed and robot profile; a section may differ.
 
-        In a simulated world of rough ground the risk map is one of terrain, and the LiDAR looks down at it.
+        In a simulated world of rough ground the risk map is one of terrain, the LiDAR looks down at it, irm and
+        reconciler keep off what may tip the robot, and irm passes over crumbs.
         """
         section: dict[str, Any] = dict(getattr(self, service))
         rough, other = is_rough(self.sim), self.profile != DEFAULT_PROFILE
@@ -150,12 +151,26 @@ class Config(BaseSettings):
             section.setdefault("profile", self.profile)
         elif service == "reconciler":
             section = {"footprint_radius_m": PROFILES[self.profile].footprint_radius_m, **section}
-            section.setdefault("clearance_margin_m", ROUGH_MARGIN_M if rough else 0.0)
+            if rough:
+                own = {"clearance_margin_m": self.options("irm")["clearance_margin_m"]}
+                section = {**own, "comfort_clearance_m": ROUGH_COMFORT_M, **section}
         if service == "riskmap" and rough:
             section.setdefault("model", "terrain")
         elif service == "irm" and rough:
-            section = {"clearance_margin_m": ROUGH_MARGIN_M, **ROUGH_CRUMBS, **section}
+            section = {
+                "clearance_margin_m": ROUGH_MARGIN_M,
+                "comfort_clearance_m": ROUGH_COMFORT_M,
+                "sensor_height_m": sensor_height_m(self.sim),
+                **ROUGH_CRUMBS,
+                **section,
+            }
         return section
+
+
+def sensor_height_m(sim: Mapping[str, Any]) -> float:
+    """Height of the simulator's sensors over the ground, m."""
+    lidar = sim.get("lidar")
+    return float(lidar.get("height_m", SENSOR_HEIGHT_M)) if isinstance(lidar, Mapping) else SENSOR_HEIGHT_M
 
 
 def is_rough(sim: Mapping[str, Any]) -> bool:
@@ -168,8 +183,13 @@ def is_rough(sim: Mapping[str, Any]) -> bool:
 DOWNWARD_LIDAR = {"rings": 24, "elevation_min_deg": -45.0, "elevation_max_deg": 15.0}
 """For rough ground: with the default, no ring meets the ground nearer than 3 m, nor any way down at all."""
 
-ROUGH_MARGIN_M = 0.1
+ROUGH_MARGIN_M = 0.05
 """Beside a stone, a foot that is so far off its place tips the robot; on flat ground a wall only stops it."""
+ROUGH_COMFORT_M = 0.6
+"""Where there is room, paths keep so far off what may tip the robot."""
+
+SENSOR_HEIGHT_M = 0.8
+"""The simulator's default."""
 
 ROUGH_CRUMBS = {"min_node_entropy": 0.2, "frontier_min_gain": 0.3}
 """For irm on rough ground, where every stone leaves a corner that is hard to look into."""

@@ -142,10 +142,11 @@ class SafetyState(StrEnum):
 class Plan(Message):
     """The only motion output: a timed path in `odom` for the follower.
 
-    plan_id: increases. valid: false means stop. points from the robot's place on: x, y, yaw, speed (not to exceed),
-    time since the stamp in seconds. ttl_s: the follower stops when no newer plan came for so long.
-    tau_s: time of the old policy that was kept (tau*); kept_points: so many points belong to it.
-    risk_stamp_ns: newest cloud that this plan knows of.
+    plan_id: increases. valid: false means stop. A path whose first yaw points against its first step is driven
+    backwards: a robot that backs off does not turn in the tight place where it was blocked. points from the robot's
+    place on: x, y, yaw, speed (not to exceed), time since the stamp in seconds. ttl_s: the follower stops when no
+    newer plan came for so long. tau_s: time of the old policy that was kept (tau*); kept_points: so many points
+    belong to it. risk_stamp_ns: newest cloud that this plan knows of.
     """
 
     schema_name: ClassVar[str] = "plan"

@@ -77,7 +77,7 @@ class CoverageScan(Message):
     """The coverage sensor has looked once.
 
     keyframe_id: the nearest keyframe; pose_in_keyframe: the sensor in that keyframe's frame. pose_in_odom: the same
-    pose in odom, for the line of sight through the risk map.
+    pose in odom, for the line of sight through the risk map; its z is that of the sensor.
     """
 
     schema_name: ClassVar[str] = "coverage_scan"

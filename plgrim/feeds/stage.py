@@ -122,7 +122,7 @@ class FeedStage:
         return CoverageScan(
             stamp_ns=now,
             keyframe_id=nearest,
-            pose_in_odom=_pose(moment.odom),
+            pose_in_odom=_pose(moment.odom).model_copy(update={"z_m": self._recording.sensor_height_m}),
             pose_in_keyframe=_pose(Planar(x, y, yaw).inverse().compose(moment.map)),
             range_m=range_m,
             fov_rad=fov_rad,

@@ -54,6 +54,7 @@ _BLOCKED_MOST = 2
 _DOUBT_WINDOWS = 1.25
 """Keyframes within so many widths of the window are asked for their certainty: what they saw may lie in it."""
 _MAX_PENDING = 50
+_MOVES_MPS = 0.02
 _PROGRESS_M2 = 0.3
 _SAME_M = 1e-6
 _SKIPPED_VERSIONS = 1000
@@ -94,6 +95,7 @@ class IrmStage:
         self._resumed = False
         self._pending: list[CoverageScan] = []
         self._penalties: list[tuple[int, float, float]] = []
+        self._backwards = False
         self._global_ns = -(10**18)
         self._covered_m2 = 0.0
 
@@ -162,10 +164,12 @@ class IrmStage:
         """Where the robot was blocked or stuck, the ground ahead is riskier than it looks."""
         memory = int(self._config.blocked_memory_s * SECOND_NS)
         self._penalties = [p for p in self._penalties if now - p[0] < memory]
+        if abs(odometry.speed_mps) > _MOVES_MPS:
+            self._backwards = odometry.speed_mps < 0.0
         follower = inputs.current(FOLLOWER)
         if follower is None or not (follower.blocked or follower.stuck):
             return
-        ahead = planar(odometry.pose).apply(0.5, 0.0)
+        ahead = planar(odometry.pose).apply(-0.5 if self._backwards else 0.5, 0.0)
         here = [p for p in self._penalties if math.dist(ahead, p[1:]) <= 0.3]
         if len(here) < _BLOCKED_MOST and all(now - p[0] >= _BLOCKED_AGAIN_NS for p in here):
             self._penalties.append((now, *ahead))
@@ -291,6 +295,7 @@ class IrmStage:
             "odom": self._odom.state(),
             "out_of_reach": self._out_of_reach.state(),
             "penalties": self._penalties,
+            "backwards": self._backwards,
             "pending": [scan.model_dump() for scan in self._pending],
             "anchors": self._local.state() if self._local else [],
             "global_ns": self._global_ns,
@@ -313,6 +318,7 @@ class IrmStage:
         self._odom.set_state(state["odom"])
         self._out_of_reach.set_state(state["out_of_reach"])
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
+        self._backwards = bool(state["backwards"])
         self._pending = [CoverageScan(**scan) for scan in state["pending"]]
         self._global_ns = state["global_ns"]
         self._covered_m2 = state["covered_m2"]

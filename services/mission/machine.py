@@ -176,9 +176,9 @@ class Machine:
         if self.settled_since_ns < 0:
             self.settled_since_ns = facts.now_ns
         if facts.now_ns - self.settled_since_ns >= self.config.settle_s * SECOND_NS:
-            reason = "all ground that could be reached is covered"
+            reason = "all ground that could be reached and is worth the way is covered"
             if facts.left:
-                reason += f"; {facts.left} places could not be reached, or are not worth the way"
+                reason += f"; {facts.left} places are left"
             self._end_or_go_home(FinishReason.COVERED, reason, self.config.return_when_done, facts)
 
     def _check_time(self, facts: Facts) -> None:

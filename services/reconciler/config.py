@@ -75,6 +75,9 @@ class Config(BaseModel):
     blocked_s: float = Field(
         1.0, gt=0, le=60, description="Blocked or stuck so long, the path is dropped, s."
     )
+    idle_s: float = Field(
+        6.0, gt=0, le=600, description="Without a way on for so long, it goes back twice as far as that, s."
+    )
     back_off_m: float = Field(
         0.4, ge=0, le=2, description="Blocked, the robot drives back so far on the way that it came, m."
     )

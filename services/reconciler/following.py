@@ -16,18 +16,21 @@ from services.reconciler.episode import Committed, Opened
 from services.reconciler.path import STEP_M, Ground, clearance_at, first_hazard, project, resample, smooth
 from services.reconciler.trail import Trail
 
-_KEPT = ("at", "end", "changed", "why", "trouble_ns", "backing_ns")
+_KEPT = ("at", "end", "changed", "why", "trouble_ns", "backing_ns", "idle_ns")
 """What a snapshot holds as it is."""
-_TRAIL_M = 2.0
+_TRAIL_M = 6.0
 _BACKING_S = 5.0
 """Backing off ends then at the latest."""
+_WAY_OUT_M = 0.6
+"""Over this a robot in a tight place may have less clearance than paths keep."""
 
 
 class Driven:
     """The committed policy as the robot drives it.
 
     at: index of the robot's place on the line. end: index up to which the line holds. changed: since the last plan.
-    why: what was last decided about it. backing_ns: since when the robot backs off; -1: it does not.
+    why: what was last decided about it. backing_ns, idle_ns: since when the robot backs off, or has no way on; -1: it
+    does not, or has.
     """
 
     def __init__(self, config: Config) -> None:
@@ -39,6 +42,7 @@ class Driven:
         self.why = "starting"
         self.trouble_ns = -1
         self.backing_ns = -1
+        self.idle_ns = -1
         self._trail = Trail(_TRAIL_M)
 
     @property
@@ -67,25 +71,36 @@ class Driven:
 
     def check_hazards(self, ground: Ground) -> None:
         """Truncate the path before the first place where the robot does not fit or the ground is unknown."""
-        if self.committed is None or self.backing:
+        if self.committed is None:
             return
-        s, points = ground.spec, self.committed.points
-        hazard = first_hazard(
-            points, self.at + 2, ground.state, ground.clearance_m, s.resolution_m, s.ix0, s.iy0,
-            self._needed_m(ground, points[self.at]),
-        )  # fmt: skip
+        points = self.committed.points
+        has_m = self._clearance_m(ground, points[self.at]) - 0.02
+        out = min(self.at + 2 + round(_WAY_OUT_M / STEP_M), len(points))
+        least_m = (
+            self._config.footprint_radius_m
+            - 0.05
+            + (0.0 if self.backing else self._config.clearance_margin_m)
+        )
+        hazard = self._first_hazard(ground, points[:out], self.at + 2, min(least_m, has_m))
+        if hazard < 0 and not self.backing:
+            hazard = self._first_hazard(ground, points, out, least_m)
         end = len(points) - 1 if hazard < 0 else max(hazard - 3, self.at)
         if end != self.end:
             self.end, self.changed = end, True
             if hazard >= 0:
                 self.why = f"hazard {(hazard - self.at) * STEP_M:.1f} m ahead"
 
-    def _needed_m(self, ground: Ground, here: NDArray[np.float64]) -> float:
-        """Clearance that the path has to keep; where the robot has not even that, what it has: it must get away."""
-        c, s = self._config, ground.spec
-        has_m = clearance_at(ground.clearance_m, s.resolution_m, s.ix0, s.iy0, float(here[0]), float(here[1]))
-        least_m = c.footprint_radius_m - 0.05
-        return max(least_m, min(least_m + c.clearance_margin_m, has_m - 0.02))
+    @staticmethod
+    def _clearance_m(ground: Ground, at: NDArray[np.float64]) -> float:
+        s = ground.spec
+        return clearance_at(ground.clearance_m, s.resolution_m, s.ix0, s.iy0, float(at[0]), float(at[1]))
+
+    @staticmethod
+    def _first_hazard(ground: Ground, points: NDArray[np.float64], begin: int, needed_m: float) -> int:
+        s = ground.spec
+        return first_hazard(
+            points, begin, ground.state, ground.clearance_m, s.resolution_m, s.ix0, s.iy0, needed_m
+        )
 
     def follow(self, now: Stamp, odometry: Odometry, follower: FollowerState | None, plan_id: int) -> bool:
         """Where the robot is on its path. Returns whether the path was dropped: left, or no way on along it.
@@ -106,7 +121,8 @@ class Driven:
         dropped = off > self._config.off_path_m
         if dropped:
             self.drop("off the path")
-        dropped |= self._meet_trouble(now, odometry, follower, plan_id)
+        else:
+            dropped = self._meet_trouble(now, odometry, follower, plan_id)
         if self.backing and (self.left_m() < STEP_M or now - self.backing_ns > _BACKING_S * SECOND_NS):
             self.drop("backed off")
             dropped = True
@@ -130,24 +146,42 @@ class Driven:
         backing = self.backing
         self.drop("blocked")
         if not backing:
-            self._back_off(now, odometry)
+            self._back_off(now, odometry, self._config.back_off_m, "blocked: backs off")
         return True
 
-    def _back_off(self, now: Stamp, odometry: Odometry) -> None:
-        """Drive back a little on the way that the robot came, facing what is in its way."""
+    def leave_if_idle(self, now: Stamp, odometry: Odometry, wanted: bool) -> None:
+        """With no way on for long, the robot goes back on the way that it came: it stands where nothing leads out.
+
+        wanted: it is to drive.
+        """
+        if not wanted or self.backing or self.left_m() >= STEP_M:
+            self.idle_ns = -1
+        elif self.idle_ns < 0:
+            self.idle_ns = now
+        elif now - self.idle_ns > self._config.idle_s * SECOND_NS:
+            self.idle_ns = -1
+            self.drop("no way on")
+            self._back_off(now, odometry, 2.0 * self._config.back_off_m, "no way on: goes back")
+
+    def _back_off(self, now: Stamp, odometry: Odometry, distance_m: float, why: str) -> None:
+        """Drive back on the way that the robot came, facing what is in its way."""
         x, y = odometry.pose.x_m, odometry.pose.y_m
-        line = resample(self._trail.back(x, y, self._config.back_off_m))
+        line = resample(self._trail.back(x, y, distance_m))
         if len(line) > 1:
             nothing = np.zeros((0, 2), np.int64)
             self.committed = Committed(line, nothing, np.zeros(0, np.int64))
-            self.end, self.backing_ns, self.why = len(line) - 1, now, "blocked: backs off"
+            self.end, self.backing_ns, self.why = len(line) - 1, now, why
 
     def drop(self, why: str) -> None:
         """Forget the path: the robot stands until there is another."""
         self.committed = None
-        self.backing_ns = -1
+        self.backing_ns = self.trouble_ns = -1
         self.at = self.end = 0
         self.changed, self.why = True, why
+
+    def forget_trail(self) -> None:
+        """The robot is not where the trail ends any more."""
+        self._trail.load([])
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""

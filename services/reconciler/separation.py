@@ -19,6 +19,8 @@ from services.reconciler.path import arc_lengths
 _LEVELS = 10
 """Speeds that are tried, as shares of the top speed."""
 _TICK_S = 0.05
+_SILENCE_NS = 2 * SECOND_NS
+"""Clouds that stop coming hold the robot by then, as the risk map is stale; a robot that has grids alone goes on."""
 
 
 class Separation(NamedTuple):
@@ -80,7 +82,7 @@ class Guard:
             config.reaction_s,
             config.max_acceleration_mps2,
         )
-        self._most, self._watched_ns = 1.0, -1
+        self._most, self._watched_ns, self._told_ns = 1.0, -1, -1
 
     @property
     def share(self) -> float:
@@ -88,9 +90,16 @@ class Guard:
         return math.floor(self._most * _LEVELS + 1e-9) / _LEVELS
 
     def watch(self, now: Stamp, moving: NDArray[np.float32] | None, line: NDArray[np.float64]) -> None:
-        """Look at the newest points of what moves, (m, 2) m; None: not known. line: ahead of the robot, (k, 2) m."""
+        """Look at the newest points of what moves, (m, 2) m; None: not known now, the share stays for `_SILENCE_NS`.
+
+        line: ahead of the robot, (k, 2) m.
+        """
         elapsed_s = (now - self._watched_ns) / SECOND_NS if self._watched_ns >= 0 else 0.0
         self._watched_ns = now
+        if moving is not None:
+            self._told_ns = now
+        elif now - self._told_ns < _SILENCE_NS and self._told_ns >= 0:
+            return  # what was told last still holds
         found = 1.0
         if moving is not None:
             found = safe_share(line, moving.astype(np.float64), self._top_mps, self._rules)
@@ -98,8 +107,8 @@ class Guard:
 
     def state(self) -> list[float | int]:
         """For a snapshot."""
-        return [self._most, self._watched_ns]
+        return [self._most, self._watched_ns, self._told_ns]
 
     def load(self, state: list[float | int]) -> None:
         """Go on from `state`."""
-        self._most, self._watched_ns = float(state[0]), int(state[1])
+        self._most, self._watched_ns, self._told_ns = float(state[0]), int(state[1]), int(state[2])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from planning.grid import GridSpec
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp, Topic
+from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, LocalPhase, LocalPolicy, Plan
 from schemas.sensing import Odometry
 from schemas.snapshot import pack_message, pack_snapshot, unpack_message, unpack_snapshot
@@ -96,11 +97,10 @@ class ReconcilerStage:
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """One cycle: safety first, then the path, then episodes."""
         odometry, risk = inputs.latest(ODOMETRY), inputs.latest(RISK_MAP)
+        moving = inputs.current(MOVING)
+        points = None if moving is None else moving.points_m
         if odometry is not None:
-            moving = inputs.current(MOVING)
-            self._guard.watch(
-                now, None if moving is None else moving.points_m, self._driven.ahead(odometry.message)
-            )
+            self._guard.watch(now, points, self._driven.ahead(odometry.message))
         verdict = self._judge(now, inputs)
         if not verdict.may_move:
             self._asked_ns = -1
@@ -120,6 +120,10 @@ class ReconcilerStage:
             self._install(now, received.message, odometry.message, ground)
         if risk.fresh or self._driven.changed:
             self._driven.check_hazards(ground)
+            if self._driven.changed:  # another line: who is in its way?
+                self._guard.watch(now, points, self._driven.ahead(odometry.message))
+                verdict = self._judge(now, inputs)
+        self._driven.leave_if_idle(now, odometry.message, verdict.may_move and self._left(inputs))
         irm = inputs.current(LOCAL_IRM)
         if verdict.may_move and irm is not None and self._wants_episode(now):
             found += self._open(now, irm, odometry.message, ground)
@@ -127,6 +131,12 @@ class ReconcilerStage:
         return found
 
     # --- safety -----------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def _left(inputs: Inputs) -> bool:
+        """Whether something is left to drive for: exploring or on the way home."""
+        mission = inputs.current(MISSION)
+        return mission is not None and mission.phase in (MissionPhase.EXPLORE, MissionPhase.RETURN)
 
     def _judge(self, now: Stamp, inputs: Inputs) -> Verdict:
         c = self._config
@@ -342,11 +352,12 @@ class ReconcilerStage:
         points, first = _NO_POINTS, max(driven.at - 1, 0)
         if moving and driven.committed is not None:
             points = driven.committed.points[first : driven.end + 1]
-        speed, time_s = speeds(points, abs(odometry.speed_mps), ground, self._config, share)
-        yaw = headings(points)
+        c, yaw = self._config, headings(points)
+        kept = min(len(points), max(self._kept_end - first, 0))
         if driven.backing:
-            speed = np.minimum(speed, self._config.min_speed_mps)
+            kept, share = 0, min(share, c.min_speed_mps / c.max_speed_mps)
             yaw = np.remainder(yaw + 2.0 * math.pi, 2.0 * math.pi) - math.pi
+        speed, time_s = speeds(points, abs(odometry.speed_mps), ground, c, share)
         return Plan(
             stamp_ns=now,
             plan_id=max(self._plan_id, 1),
@@ -354,8 +365,8 @@ class ReconcilerStage:
             valid=moving and len(points) > 0,
             safety=verdict.state,
             reason=verdict.reason or driven.why,
-            tau_s=self._tau_s,
-            kept_points=min(len(points), max(self._kept_end - first, 0)),
+            tau_s=0.0 if driven.backing else self._tau_s,
+            kept_points=kept,
             ttl_s=self._config.plan_ttl_s,
             risk_stamp_ns=risk_stamp_ns,
             x_m=np.ascontiguousarray(points[:, 0]),
@@ -392,6 +403,7 @@ class ReconcilerStage:
         follower would take a new plan for an old one."""
         self._episode, self._plan_id = self._episode + _SKIPPED_IDS, self._plan_id + _SKIPPED_IDS
         self._driven.drop("resumed after a restart")
+        self._driven.forget_trail()
         self._opened = None
         self._asked_ns = self._driven.trouble_ns = -1
         self._plan = None

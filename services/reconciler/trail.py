@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _APART_M = 0.05
+_GAP_M = 0.25
 
 
 class Trail:
@@ -31,6 +32,8 @@ class Trail:
         line, left_m = [(x_m, y_m)], distance_m
         for point in reversed(self._points):
             step_m = math.dist(line[-1], point)
+            if step_m > _GAP_M:  # nobody drove there
+                break
             if step_m >= left_m:
                 share = left_m / step_m
                 line.append(

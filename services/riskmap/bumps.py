@@ -12,7 +12,7 @@ from schemas.base import Pose
 from services.riskmap.collision import RiskLayers
 
 _SAME_PLACE_M = 0.4
-"""Contacts from poses nearer to each other than this are met at one place."""
+"""Contacts whose places are nearer to each other than this are met at one place."""
 _MOST = 64
 
 
@@ -51,7 +51,7 @@ class Bumps:
         again = [
             m[3:]
             for k, m in enumerate(met)
-            if any(math.dist(m[1:3], other[1:3]) < _SAME_PLACE_M for other in met[:k])
+            if any(math.dist(m[3:], other[3:]) < _SAME_PLACE_M for other in met[:k])
         ]
         return np.array(again, dtype=np.float64).reshape(-1, 2)
 

@@ -280,4 +280,6 @@ def test_on_rough_ground_a_look_passes_over_low_blocks_and_not_over_walls() -> N
         middle = layer.read(spec)[spec.cell_of(0.05, 1.05)[0]]
         far[name] = spec.centres_x()[middle > 0]
     assert ((far["low"] < 2.5) | (far["low"] > 2.7)).all() and far["low"].max() > 5.0
-    assert far["wall"].max() < 2.5 and far["flat"].max() < 2.5  # the surface, and what is right behind it, count
+    assert (
+        far["wall"].max() < 2.5 and far["flat"].max() < 2.5
+    )  # the surface, and what is right behind it, count

@@ -172,7 +172,9 @@ def test_a_moved_keyframe_moves_what_is_covered() -> None:
     seen, moved = before.cell == 2, after.cell == 2
     shifted, walls = np.zeros_like(seen), np.zeros_like(seen)
     shifted[2:, 5:] = seen[:-2, :-5]
-    walls[2:, 5:] = ~np.isin(before.cell[:-2, :-5], (1, 2))  # the foot of a wall that was looked at moves along
+    walls[2:, 5:] = ~np.isin(
+        before.cell[:-2, :-5], (1, 2)
+    )  # the foot of a wall that was looked at moves along
     ground = np.isin(after.cell, (1, 2))
     assert seen.sum() > 300
     assert ((shifted & ground) == (moved & ground & ~walls)).mean() > 0.999

@@ -179,4 +179,4 @@ def test_little_that_is_far_away_is_left(worth_m_per_nat: float, area_m2: float,
         state = bench.step((COVERAGE, coverage(settled=False, area_m2=area_m2)))
     assert (state.phase == MissionPhase.DONE) == covered
     if covered:
-        assert "not worth the way" in state.reason
+        assert "places are left" in state.reason

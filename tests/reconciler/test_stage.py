@@ -507,3 +507,28 @@ def test_paths_keep_their_margin_and_a_robot_in_a_tight_place_gets_out_of_it() -
     rig.wall_at(rig.x_m - 0.36, rig.y_m, 0.1)  # 0.26 m of clearance: less than is kept, more than it needs
     rig.run(2.5)
     assert rig.last().valid and len(rig.last().x_m) > 10
+
+
+def test_it_does_not_back_off_into_what_stands_on_its_trail() -> None:
+    rig = driving()
+    rig.moving, rig.follower_blocked = False, True
+    yaw = rig.yaw_rad
+    rig.run(FEW.blocked_s - 0.1)
+    behind = rig.x_m - 0.6 * math.cos(yaw), rig.y_m - 0.6 * math.sin(yaw)
+    rig.wall_at(*behind, 0.15)
+    rig.run(0.5)
+    plan = rig.last()
+    clear = [rig.clearance_at(float(x), float(y)) for x, y in zip(plan.x_m, plan.y_m, strict=True)]
+    assert "goes back" not in plan.reason
+    assert not plan.valid or min(clear) >= FEW.footprint_radius_m - 0.1
+
+
+def test_without_a_way_on_for_long_it_goes_back() -> None:
+    rig = driving()
+    rig.answer = False
+    rig.reconciler.stage._driven.drop("a test")  # type: ignore[attr-defined]
+    was = rig.x_m, rig.y_m
+    rig.run(FEW.idle_s + 0.5)
+    assert rig.last().valid and math.cos(rig.last().yaw_rad[0] - rig.yaw_rad) > 0.8
+    rig.run(4.0)
+    assert math.dist(was, (rig.x_m, rig.y_m)) > 0.5
