@@ -527,8 +527,8 @@ def test_without_a_way_on_for_long_it_goes_back() -> None:
     rig = driving()
     rig.answer = False
     rig.reconciler.stage._driven.drop("a test")  # type: ignore[attr-defined]
-    was = rig.x_m, rig.y_m
+    was, came = (rig.x_m, rig.y_m), rig.yaw_rad
     rig.run(FEW.idle_s + 0.5)
-    assert rig.last().valid and math.cos(rig.last().yaw_rad[0] - rig.yaw_rad) > 0.8
+    assert rig.last().valid and math.cos(rig.last().yaw_rad[0] - came) > 0.5
     rig.run(4.0)
     assert math.dist(was, (rig.x_m, rig.y_m)) > 0.5
