@@ -32,7 +32,7 @@ class Config(BaseModel):
         4.0, ge=0, le=600, description="Covered when there was nothing left to go to for so long, s."
     )
     worth_m_per_nat: float = Field(
-        150.0,
+        60.0,
         ge=0,
         le=1e6,
         description="What is farther away than this for each nat it promises is not worth the way, m. 0: all is,",
