@@ -50,6 +50,10 @@ class Components:
             self._members[self._label[a]] -= cut
             self._give(cut)
 
+    def largest(self) -> int:
+        """The number of the component with the most nodes (the lowest number of several); -1 when there is none."""
+        return min(self._members, key=lambda k: (-len(self._members[k]), k), default=-1)
+
     def label(self, node: int) -> int:
         """The same number for all nodes of a component; -1 for a node that is not there."""
         return self._label.get(node, -1)

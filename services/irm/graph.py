@@ -126,6 +126,11 @@ class RoadGraph:
         """Which components of the breadcrumbs' graph a node is joined to, by numbers that hold until it changes."""
         return {self._components.label(n) for n in self._crumbs_beside(node)}
 
+    def is_largest(self, components: set[int]) -> bool:
+        """Whether the largest component of the breadcrumbs' graph is among these, or there is none yet."""
+        largest = self._components.largest()
+        return largest < 0 or largest in components
+
     def leads_to(self, frontier: int, components: set[int]) -> bool:
         """Whether a way leads from the robot, in these components, to a frontier; no other frontier may lie on it."""
         if self.graph.has_edge(ROBOT, frontier):

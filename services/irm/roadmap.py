@@ -28,8 +28,8 @@ _SHIFTED_M, _TORN_M = 0.05, 1.0
 
 _LEVEL_M = 0.1
 """Heights of frontiers change by such steps, so that the noise of the risk map is not told every second."""
-_CUT_OFF_TIMES = 4
-"""So many times longer frontiers are kept while no way leads to any."""
+_CUT_OFF_TIMES = 10
+"""So many times longer frontiers are kept while the robot is cut off."""
 
 
 @dataclass(slots=True)
@@ -251,14 +251,13 @@ class Roadmap:
     def _give_up_isolated(self, now_ns: int) -> None:
         """Frontiers that no way over the graph has led to for long cannot be planned for.
 
-        When no way leads to any of them, it is the robot that is cut off, and it is given time to get out.
+        Where the robot has no way to most of the graph, it is the robot that is cut off: it is given time to get out.
         """
         components = self.road.components_of(ROBOT)
-        led_to = {n: self.road.leads_to(n, components) for n in sorted(self.manager.frontiers)}
-        rounds = 3 * self.config.missed_rounds * (1 if any(led_to.values()) else _CUT_OFF_TIMES)
-        for node, leads in led_to.items():
+        rounds = 3 * self.config.missed_rounds * (1 if self.road.is_largest(components) else _CUT_OFF_TIMES)
+        for node in sorted(self.manager.frontiers):
             f = self.manager.frontiers[node]
-            f.isolated = 0 if leads else f.isolated + 1
+            f.isolated = 0 if self.road.leads_to(node, components) else f.isolated + 1
             if f.isolated > rounds:
                 self.manager.give_up(f, ISOLATED, now_ns)
                 self.road.drop_node(node)
