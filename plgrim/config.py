@@ -191,8 +191,8 @@ ROUGH_COMFORT_M = 0.6
 SENSOR_HEIGHT_M = 0.8
 """The simulator's default."""
 
-ROUGH_CRUMBS = {"min_node_entropy": 0.2, "frontier_min_gain": 0.3}
-"""For irm on rough ground, where every stone leaves a corner that is hard to look into."""
+ROUGH_CRUMBS = {"min_node_entropy": 0.2, "frontier_min_gain": 0.3, "max_edge_risk": 0.9}
+"""For irm on rough ground, where every stone leaves a corner that is hard to look into, and no way is without risk."""
 
 ROUGH_WORLDS = ("cave", "lava_tube", "short_lava_tube")
 """Built-in worlds whose ground is not flat."""

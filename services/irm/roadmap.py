@@ -28,6 +28,8 @@ _SHIFTED_M, _TORN_M = 0.05, 1.0
 
 _LEVEL_M = 0.1
 """Heights of frontiers change by such steps, so that the noise of the risk map is not told every second."""
+_MOST_RISK = 0.95
+"""Of an edge that was driven, however its ground looks now."""
 _CUT_OFF_TIMES = 10
 """So many times longer frontiers are kept while the robot is cut off."""
 
@@ -168,6 +170,11 @@ class Roadmap:
             return True
         if not (self.graph.has_edge(a, b) and search.knows(*target)):
             return False
+        held = self.graph.edges[a, b]
+        if held["driven"] and d < 2.0 * self.config.max_edge_m and not self._stacked(a, b):
+            # Riskier than thought, perhaps, but it leads there: the robot must not be cut off from where it came from.
+            self.road.set_edge(a, b, self._climbed_m(a, b, d), min(rho, _MOST_RISK), 1)
+            return True
         # No way within the window is no evidence against a way that the robot has driven: it may lead around outside.
         misplaced = search.is_lethal(*place) or search.is_lethal(*target)
         if not self.graph.edges[a, b]["driven"] or (search.obstacle_between(place, target) and not misplaced):

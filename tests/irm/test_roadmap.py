@@ -345,3 +345,25 @@ def test_differences_from_a_journal_lead_to_the_graph_that_was_told() -> None:
     assert pack_snapshot(mine) == pack_snapshot(theirs)
     whole = twin.message(Pose(), Pose(), 0, False)
     assert whole.base_version == 0 and whole.irm_version == drive.roadmap.version + 1
+
+
+def test_a_way_that_was_driven_stays_when_its_ground_turns_out_risky_and_stones_lie_on_the_straight_line() -> (
+    None
+):
+    drive = Drive(room(0.0, 0.0, 9.0, 3.0, RES))
+    for x in np.arange(1.5, 7.0, 0.5):
+        drive.to(float(x), 1.5)
+    graph = drive.roadmap.graph
+    driven = [(a, b) for a, b, edge in graph.edges(data=True) if edge["driven"] and ROBOT not in (a, b)]
+    assert driven
+    a, b = driven[0]
+    (ax, ay), (bx, by) = drive.roadmap.road.place(a), drive.roadmap.road.place(b)
+    x, y = 0.5 * (ax + bx), 0.5 * (ay + by)
+    drive.flat.fill(x - 0.15, y - 0.15, x + 0.15, y + 0.15, LETHAL)
+    risk = drive.flat.risk_map(6.5, 1.5, 16.0)
+    deep = risk.model_copy(update={"hazard_cvar": risk.hazard_cvar + np.float32(1.5)})
+    for _ in range(20):
+        drive.roadmap.update(drive.belief.window(deep, 6.5, 1.5), 6.5, 1.5, drive.tick * SECOND, 1.0)
+        drive.tick += 1
+        drive.roadmap.version += 1  # edges are reviewed in turn
+    assert graph.has_edge(a, b) and graph.edges[a, b]["risk"] > CONFIG.max_edge_risk
