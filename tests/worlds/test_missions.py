@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
 NARROW = {"sim": {"coverage_sensor": {"fov_deg": 90.0}}, "irm": {"sensor_fov_deg": 90.0}}
 DRIFT = {"sim": {"slam": {"drift_fraction": 0.02, "drift_yaw_deg_per_10m": 1.5}}}
-"""So much that where the loop closes the estimate is some two metres off."""
+"""Rms. Where the loop closes the estimate is 1.2 m off with seed 1, 1.3 m with seed 4, 2.1 m with seed 6."""
 
 
 @pytest.fixture(autouse=True)
@@ -216,7 +216,7 @@ def closure() -> Closure:
     return Closure()
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 4, 6])
 def test_a_loop_that_closes_moves_the_graph_and_not_the_path(closure: Closure, seed: int) -> None:
     result = Mission("loop", seed, DRIFT, watchers=[closure]).run(600.0)
     assert result["coverage_judge"] >= 0.99
