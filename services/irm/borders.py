@@ -40,12 +40,14 @@ def find_frontiers(window: Window, config: Config, least: float | None = None) -
     snapped to the plane; each cell of the piece counts for the nearest block, up to the frontier's reach. Where the
     robot's centre can get to the border of ground never seen that it may well enter (the way around a corner; not a
     gap in a ragged wall that its body does not fit), that is open too, and counts what ground may lie behind.
+    Ground that the risk map has forgotten had its frontiers when it was seen; what opens there since is due to how a
+    closure moved its patches.
     """
     s = window.spec
     labels = np.zeros(s.shape, np.int32)
     openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
     openings &= near_robot(window, config.opening_range_m)
-    open_ground = window.uncovered | openings
+    open_ground = (window.uncovered & (window.state == FREE)) | openings
     pieces = label_components(open_ground, labels)
     if pieces == 0:
         return []

@@ -22,7 +22,10 @@ from services.irm.resample import bounds, moved, resample
 from services.irm.tiles import TILE, TileLayer
 
 _SPACING_M = 4.0
-"""So far from its keyframe a patch goes on; risk maps reach much farther, so that neighbouring patches overlap."""
+"""So far from its keyframe a patch goes on."""
+_REACH_M = 12.0
+"""Half a side of what a patch takes of each risk map: what lies farther off was seen long ago, or moves with the least
+turn of the keyframe, while its footprints belong to keyframes that are nearer. Neighbouring patches overlap."""
 
 
 @dataclass(slots=True)
@@ -79,9 +82,11 @@ class GroundStore:
         self._written = target if self._written is None else _around(self._written, target)
         if anchor.keyframe == NOBODY:
             return
+        near, ours = _around_middle(spec, _REACH_M)
+        target, cells = moved(near, seen[ours], frame)
         patch = self._patch(anchor, target)
         if patch.placed != patch.pose:
-            target, cells = moved(spec, seen, patch.motion.inverse().compose(frame))
+            target, cells = moved(near, seen[ours], patch.motion.inverse().compose(frame))
         _grow(patch, target)
         common = overlap(patch.spec, target)
         assert common is not None  # the patch has just grown over it
@@ -223,6 +228,18 @@ def _around(a: GridSpec, b: GridSpec) -> GridSpec:
     width = max(a.ix0 + a.width, b.ix0 + b.width) - ix0
     height = max(a.iy0 + a.height, b.iy0 + b.height) - iy0
     return GridSpec(a.resolution_m, ix0, iy0, width, height)
+
+
+def _around_middle(spec: GridSpec, reach_m: float) -> tuple[GridSpec, tuple[slice, slice]]:
+    """The part of a window up to a distance from its middle, where the robot is, along rows and columns."""
+    reach = round(reach_m / spec.resolution_m)
+    rows = slice(max(0, spec.height // 2 - reach), min(spec.height, spec.height // 2 + reach + 1))
+    columns = slice(max(0, spec.width // 2 - reach), min(spec.width, spec.width // 2 + reach + 1))
+    size = (columns.stop - columns.start, rows.stop - rows.start)
+    return GridSpec(spec.resolution_m, spec.ix0 + columns.start, spec.iy0 + rows.start, *size), (
+        rows,
+        columns,
+    )
 
 
 def _grow(patch: _Patch, target: GridSpec) -> None:

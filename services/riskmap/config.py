@@ -57,6 +57,12 @@ class Config(BaseModel):
     free_log_odds: float = Field(
         0.4, gt=0, le=10, description="A cell is free below minus this (flat model)."
     )
+    odometry_memory_m: float = Field(
+        30.0,
+        ge=0,
+        le=10_000,
+        description="What was last seen so far a way ago is forgotten, as odometry drifts (flat model), m; 0: never.",
+    )
     # what moves (flat model)
     settle_s: float = Field(
         1.5, gt=0, le=60, description="What stands in free ground for longer no longer counts as moving, s."

@@ -13,6 +13,7 @@ from schemas.contract import SECOND_NS
 from schemas.sensing import PointCloud, ReadyGrid
 from services.riskmap.collision import RiskLayers, collision_layers
 from services.riskmap.config import Config
+from services.riskmap.drift import Drift
 from services.riskmap.extrinsics import body_box, transform, without_body
 from services.riskmap.moving import MovingRules, moving_points, update_trust
 from services.riskmap.occupancy import OccupancyWindow, integrate_sweep
@@ -30,6 +31,7 @@ class FlatModel:
         self._config = config
         self._window = OccupancyWindow(config.window_m, config.resolution_m)
         self._swept_ns = -1
+        self._drift = Drift(config.odometry_memory_m)
         self._shows_ground = np.zeros(SECTORS, dtype=np.bool_)
         self.moving_m: NDArray[np.float32] = np.zeros((0, 2), dtype=np.float32)
         """What moves in the newest sweep (see `moving.moving_points`), (m, 2) m in odom."""
@@ -56,16 +58,23 @@ class FlatModel:
             points_m, sensor, self._moving_rules(cloud.ground_z_m), w.spec.resolution_m, w.spec.ix0, w.spec.iy0,
             w.trust_s,
         )  # fmt: skip
+        touched = np.zeros(w.spec.shape, dtype=np.uint8)
         bad = integrate_sweep(
             points_m, sensor, heights, evidence, w.spec.resolution_m, w.spec.ix0, w.spec.iy0, w.log_odds,
-            w.hit_weight, w.hit_x, w.hit_y,
+            w.hit_weight, w.hit_x, w.hit_y, touched,
         )  # fmt: skip
+        w.seen_at_m[touched > 0] = self._drift.drive(s.x_m, s.y_m)
+        w.forget(self._drift.keeps_from_m())
         if c.void_range_m > 0.0:
             self._mark_voids(cloud, sensor)
         elapsed_s = (cloud.stamp_ns - self._swept_ns) / SECOND_NS if self._swept_ns >= 0 else 0.0
         self._swept_ns = cloud.stamp_ns
         update_trust(w.log_odds, elapsed_s, _CERTAIN_SHARE * c.clamp_log_odds, c.settle_s, w.trust_s)
         return bad
+
+    def located(self, map_to_odom: Pose, robot: Pose) -> None:
+        """Where SLAM says that `odom` lies in `map`; robot: its pose in `odom`."""
+        self._drift.close(map_to_odom, robot)
 
     def _mark_voids(self, cloud: PointCloud, sensor: NDArray[np.float64]) -> None:
         c, w = self._config, self._window
@@ -110,12 +119,14 @@ class FlatModel:
             "layers": list(w.layers),
             "swept_ns": self._swept_ns,
             "shows": self._shows_ground,
+            "drift": self._drift.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
         """Go on from `state`."""
         w = self._window
         w.spec = GridSpec(*state["spec"])
-        w.log_odds, w.hit_weight, w.hit_x, w.hit_y, w.trust_s = state["layers"]
+        w.log_odds, w.hit_weight, w.hit_x, w.hit_y, w.trust_s, w.seen_at_m = state["layers"]
+        self._drift.load(state["drift"])
         self._swept_ns = int(state["swept_ns"])
         self._shows_ground = state["shows"].copy()

@@ -24,7 +24,7 @@ class OccupancyWindow:
     """Log-odds of each cell being an obstacle, and where in the cell it was hit.
 
     log_odds: (h, w). hit_weight, hit_x, hit_y: (h, w) sums for the mean hit as an offset from the cell's centre, m.
-    trust_s: (h, w), see `moving.update_trust`.
+    trust_s: (h, w), see `moving.update_trust`. seen_at_m: (h, w), the distance driven when a cell was last seen, m.
     """
 
     def __init__(self, size_m: float, resolution_m: float) -> None:
@@ -38,11 +38,12 @@ class OccupancyWindow:
         self.hit_x = np.zeros(self.spec.shape, dtype=np.float32)
         self.hit_y = np.zeros(self.spec.shape, dtype=np.float32)
         self.trust_s = np.zeros(self.spec.shape, dtype=np.float32)
+        self.seen_at_m = np.zeros(self.spec.shape, dtype=np.float32)
 
     @property
     def layers(self) -> tuple[NDArray[np.float32], ...]:
         """All layers, for whoever keeps or moves them."""
-        return self.log_odds, self.hit_weight, self.hit_x, self.hit_y, self.trust_s
+        return self.log_odds, self.hit_weight, self.hit_x, self.hit_y, self.trust_s, self.seen_at_m
 
     def roll_to(self, x_m: float, y_m: float) -> None:
         """Centre the window on a point; what leaves it is forgotten, what stays is not resampled."""
@@ -56,6 +57,13 @@ class OccupancyWindow:
         if common is not None:
             for before, now in zip(old, self.layers, strict=True):
                 now[common[1]] = before[common[0]]
+
+    def forget(self, seen_before_m: float) -> None:
+        """Forget what was last seen before so much was driven."""
+        old = (self.seen_at_m < seen_before_m) & (self.log_odds != 0.0)
+        if old.any():
+            for layer in (self.log_odds, self.hit_weight, self.trust_s):
+                layer[old] = 0.0
 
 
 @njit
@@ -71,14 +79,14 @@ def integrate_sweep(
     hit_weight: NDArray[np.float32],
     hit_x: NDArray[np.float32],
     hit_y: NDArray[np.float32],
+    hit_now: NDArray[np.uint8],
 ) -> int:
     """Add one sweep to the evidence. Returns the number of points that were not finite (they are skipped).
 
     points_m: (n, 3) in the sensor's frame. sensor: x, y, z, yaw in odom. heights_m: ground z, ground tolerance,
-    robot height, self radius. evidence: hit, pass, clamp (log-odds, all positive).
+    robot height, self radius. evidence: hit, pass, clamp (log-odds, all positive). hit_now: (h, w) zeros; 1 and 2
+    afterwards in the cells that the sweep hit or passed.
     """
-    height, width = log_odds.shape
-    hit_now = np.zeros((height, width), dtype=np.uint8)
     free_range, free_angle = np.zeros(_BEARINGS, dtype=np.float64), np.zeros(_BEARINGS, dtype=np.float64)
     cosine, sine = math.cos(sensor[3]), math.sin(sensor[3])
     bad = 0

@@ -52,6 +52,10 @@ class Model(Protocol):
         """Add a sweep. Returns how many of its points were not finite."""
         ...
 
+    def located(self, map_to_odom: Pose, robot: Pose) -> None:
+        """Where SLAM says that `odom` lies in `map`; robot: its pose in `odom`."""
+        ...
+
     def apply_grid(self, grid: ReadyGrid, robot: Pose, only_new: bool) -> None:
         """Take over a ready grid; only_new: only where nothing is known yet."""
         ...
@@ -104,6 +108,7 @@ class RiskMapStage:
         odometry = inputs.latest(ODOMETRY)
         if odometry is not None:
             self._pose = odometry.message.pose
+            self._model.located(odometry.message.map_to_odom, self._pose)
             follower = inputs.current(FOLLOWER)
             blocked = follower is not None and follower.blocked
             self._bumps.observe(now, self._pose, odometry.message.speed_mps, blocked)

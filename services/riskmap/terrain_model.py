@@ -58,6 +58,9 @@ class TerrainModel:
         """What moves in the newest sweep, (m, 2): not known on rough ground, where old hits only fade."""
         return np.zeros((0, 2), dtype=np.float32)
 
+    def located(self, map_to_odom: Pose, robot: Pose) -> None:
+        """Where SLAM says that `odom` lies in `map`: of no concern, what is old grows uncertain here."""
+
     def roll_to(self, x_m: float, y_m: float) -> bool:
         """Centre the window on a point. Returns whether it moved."""
         return self._window.roll_to(x_m, y_m)

@@ -204,7 +204,7 @@ def test_after_a_closure_the_belief_is_that_of_a_drive_without_drift(straight: L
 
 def test_a_closure_there_and_back_restores_every_layer() -> None:
     loop = Loop(DRIFT)
-    loop.drive(STEPS - 10)
+    loop.drive(STEPS - 22)
     loop.step(graph=True)
     before, crumbs, frontiers = loop.layers(), loop.crumbs(), loop.frontiers()
     loop.close()

@@ -72,12 +72,12 @@ def random_window(seed: int) -> Window:
 
 
 def open_of(window: Window) -> NDArray[np.bool_]:
-    """Uncovered ground, and reachable ground at the edge of what may be entered unseen, by brute force."""
+    """Uncovered ground seen now, and reachable ground at the edge of what may be entered unseen, by brute force."""
     rows, columns = np.indices(window.spec.shape)
     away = np.hypot(rows - window.robot_cell[0], columns - window.robot_cell[1]) * window.spec.resolution_m
     near = away <= CONFIG.opening_range_m
     edge = near & window.reachable & (window.state == FREE) & _brute_edge(window)
-    found: NDArray[np.bool_] = window.uncovered | edge
+    found: NDArray[np.bool_] = (window.uncovered & (window.state == FREE)) | edge
     return found
 
 

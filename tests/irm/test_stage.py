@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from planning.frames import Planar
 from schemas.base import Message
@@ -170,14 +171,14 @@ def test_a_moved_keyframe_moves_what_is_covered() -> None:
     after = one(outputs, COVERAGE_WINDOW)
     assert isinstance(before, CoverageWindow) and isinstance(after, CoverageWindow)
     seen, moved = before.cell == 2, after.cell == 2
-    shifted, walls = np.zeros_like(seen), np.zeros_like(seen)
+    shifted = np.zeros_like(seen)
     shifted[2:, 5:] = seen[:-2, :-5]
-    walls[2:, 5:] = ~np.isin(
-        before.cell[:-2, :-5], (1, 2)
-    )  # the foot of a wall that was looked at moves along
     ground = np.isin(after.cell, (1, 2))
     assert seen.sum() > 300
-    assert ((shifted & ground) == (moved & ground & ~walls)).mean() > 0.999
+    assert (moved & ground)[shifted & ground].mean() > 0.999
+    # The foot of the walls was seen too: the left one now lies in the room, two cells of it.
+    beside = ndimage.binary_dilation(shifted, np.ones((3, 3), np.bool_), 2)
+    assert not (moved & ground & ~beside).any()
 
 
 def test_where_the_follower_is_blocked_the_edge_ahead_becomes_riskier_and_is_forgiven_later() -> None:

@@ -45,6 +45,7 @@ def integrate(
         window.hit_weight,
         window.hit_x,
         window.hit_y,
+        np.zeros(s.shape, np.uint8),
     )
 
 
