@@ -156,6 +156,8 @@ class Config(BaseSettings):
                 section = {**own, "comfort_clearance_m": ROUGH_COMFORT_M, **section}
         if service == "riskmap" and rough:
             section.setdefault("model", "terrain")
+        elif service == "gcp" and rough:
+            section = {"crumb_times": ROUGH_CRUMB_TIMES, **section}
         elif service == "irm" and rough:
             section = {
                 "clearance_margin_m": ROUGH_MARGIN_M,
@@ -193,6 +195,10 @@ SENSOR_HEIGHT_M = 0.8
 
 ROUGH_CRUMBS = {"min_node_entropy": 0.2, "frontier_min_gain": 0.3, "max_edge_risk": 0.9}
 """For irm on rough ground, where every stone leaves a corner that is hard to look into, and no way is without risk."""
+
+ROUGH_CRUMB_TIMES = 8.0
+"""For gcp on rough ground: what is left of a target gives way to eight times as much, for the robot cannot look into
+every corner there."""
 
 ROUGH_WORLDS = ("cave", "lava_tube", "short_lava_tube")
 """Built-in worlds whose ground is not flat."""

@@ -36,7 +36,10 @@ class Config(BaseModel):
     )
     crumb_margin: float = Field(2.0, ge=0, le=1000, description="this, nats, and less than half as far")
     crumb_times: float = Field(
-        8.0, ge=1, le=1e6, description="or promises so many times as much, and is less than twice as far."
+        0.0,
+        ge=0,
+        le=1e6,
+        description="or promises so many times as much, and is less than twice as far; 0: no matter how much.",
     )
     same_target_m: float = Field(
         2.0, gt=0, le=20, description="A frontier so near to the target's place is the same target, m."

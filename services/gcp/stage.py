@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -177,7 +178,8 @@ class GcpStage:
         """How much better the best must be. For a crumb, whole ground is not left unseen, nor what lies before it."""
         c = self.config
         crumb = kept.gain < max(c.crumb_share * self._target.gain, c.crumb_gain)
-        much_more = best.gain >= c.crumb_times * kept.gain and best.distance_m <= 2.0 * kept.distance_m
+        times = c.crumb_times if c.crumb_times > 0.0 else math.inf
+        much_more = best.gain >= times * kept.gain and best.distance_m <= 2.0 * kept.distance_m
         if crumb and (kept.distance_m > 2.0 * best.distance_m or much_more):
             return c.crumb_margin
         return max(self.config.switch_margin, self.config.switch_margin_relative * abs(kept.q))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
-from itertools import pairwise
 
 import numpy as np
 
@@ -20,7 +19,8 @@ from schemas.snapshot import pack_message, pack_snapshot, unpack_message, unpack
 from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
 from schemas.world import LocalIrm
 from services.lcp.config import Config
-from services.lcp.policy_path import covered_by, likely_moves, line_of, moves_to, step_terms
+from services.lcp.guide import way_along
+from services.lcp.policy_path import covered_by, likely_moves, line_of, step_terms
 from services.lcp.problem import (
     Junction,
     coverage_model,
@@ -190,21 +190,14 @@ class LcpStage:
         """Phase 1: along the global path, as far as the Local IRM reaches."""
         if policy is None or len(policy.path_xyz_m) == 0:
             return _nothing(now, request, "no target" if policy is None else policy.reason)
-        to_odom = planar(policy.map_to_odom).inverse()
-        places = [to_odom.apply(float(x), float(y)) for x, y, _ in policy.path_xyz_m]
-        way = _densify(places, policy.path_piece.tolist())
-        p = parameters(self._config.weights)
+        k_risk = parameters(self._config.weights).k_risk
         # A way that is riskier than any other planner would take is still better than to stand in a pocket.
         for max_risk in (_MAX_RISK, 1.0):
-            for x, y in reversed(way):
-                node = node_at(irm, x, y)
-                if node < 0 or irm.state[node] != 1 or node == junction.node:
-                    continue
-                moves = moves_to(irm, junction.node, node, p.k_risk, max_risk)
-                if moves:
-                    reason = f"guides to target {policy.target}"
-                    return _policy(now, request, irm, LocalPhase.GUIDE, reason, policy, junction, moves, 0,
-                                   _EMPTY_TREE, policy.target_q, 0, 0)  # fmt: skip
+            moves = way_along(irm, policy, junction.node, k_risk, max_risk)
+            if moves:
+                reason = f"guides to target {policy.target}"
+                return _policy(now, request, irm, LocalPhase.GUIDE, reason, policy, junction, moves, 0,
+                               _EMPTY_TREE, policy.target_q, 0, 0)  # fmt: skip
         return _nothing(now, request, f"no way to target {policy.target} in the Local IRM")
 
     def snapshot(self) -> bytes:
@@ -250,18 +243,6 @@ def _near_reach(irm: LocalIrm, cost: np.ndarray, radius_m: float) -> np.ndarray:
             padded[1:-1, 1:-1] | padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]
         )
     return grown.ravel()
-
-
-def _densify(places: list[tuple[float, float]], pieces: list[int]) -> list[tuple[float, float]]:
-    """Points every half metre along the pieces of a path; none where it runs from one piece to the next."""
-    dense = places[:1]
-    for ((x0, y0), (x1, y1)), (before, after) in zip(pairwise(places), pairwise(pieces), strict=True):
-        if before != after:
-            dense.append((x1, y1))
-            continue
-        steps = max(1, int(np.ceil(np.hypot(x1 - x0, y1 - y0) / 0.5)))
-        dense += [(x0 + (x1 - x0) * i / steps, y0 + (y1 - y0) * i / steps) for i in range(1, steps + 1)]
-    return dense
 
 
 def _policy(

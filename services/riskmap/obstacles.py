@@ -17,6 +17,8 @@ from services.riskmap.cells import (
     HIT_X,
     HIT_Y,
     LOG_ODDS,
+    MEAN,
+    SEEN,
 )
 from services.riskmap.ground import GroundRules, slot
 from services.riskmap.sweep import BEARINGS, Sweep
@@ -58,6 +60,9 @@ def add_hits(
                 continue
             cell = cells[row, column]
             if over > rules.height_m:
+                # Far up a slope, where a sweep misses what leads there: ground that was seen is no ceiling of itself.
+                if cell[SEEN] > 0.0 and z - cell[MEAN] <= rules.height_m:
+                    continue
                 cell[CEILING] = z if cell[CEILING_SEEN] == 0.0 else min(z, cell[CEILING])
                 cell[CEILING_SEEN] = min(cell[CEILING_SEEN] + 1.0, 1e6)
                 continue

@@ -198,11 +198,14 @@ def test_by_default_a_target_is_kept_for_one_that_is_better_by_ten_nats() -> Non
 
 
 @pytest.mark.parametrize(
-    ("left", "near_m", "switches"),
-    [(0.5, 10.0, True), (5.0, 10.0, False), (0.9, 30.0, False), (0.5, 30.0, True)],
-)
+    ("left", "near_m", "times", "switches"),
+    [
+        (0.5, 10.0, 8.0, True), (5.0, 10.0, 8.0, False), (0.9, 30.0, 8.0, False), (0.5, 30.0, 8.0, True),
+        (0.5, 30.0, 0.0, False),
+    ],
+)  # fmt: skip
 def test_a_crumb_of_a_far_target_is_no_reason_to_pass_others(
-    left: float, near_m: float, switches: bool
+    left: float, near_m: float, times: float, switches: bool
 ) -> None:
     """Chosen for 20 nats, it has `left` of them: the frontier on the way is better, but by less than the margins."""
 
@@ -212,7 +215,7 @@ def test_a_crumb_of_a_far_target_is_no_reason_to_pass_others(
         }  # fmt: skip
         return graph(version, nodes, {(1, 10): (45.0, 0.0), (1, 11): (near_m, 0.0)})
 
-    bench = Bench()
+    bench = Bench(crumb_times=times)
     assert bench.step((GLOBAL_IRM, world(1, 20.0))).target == 10
     policy = bench.step((GLOBAL_IRM, world(2, left)))
     assert policy.switched == switches

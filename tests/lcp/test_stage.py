@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from planning.lattice_graph import neighbour
 from planning.reward import RewardWeights, leftover_entropy
 from schemas.base import Pose
 from schemas.codec import Envelope, encode
@@ -16,6 +17,7 @@ from schemas.operation import MissionPhase
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
 from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
 from schemas.world import LocalIrm
+from services.lcp.guide import way_along
 from services.lcp.stage import Config, LcpStage, create, spec
 from tests.lcp.local_irms import IX0, IY0, anchor_of, global_policy, local_irm, mission, request
 from tests.planning.coverage_lattices import STEPS, Edge, Reference, random_lattice
@@ -440,3 +442,44 @@ def test_unknown_keys_are_refused_at_every_level() -> None:
 def test_its_messages_are_those_of_the_table() -> None:
     assert isinstance(local_irm(corridor({})), LocalIrm)
     assert LOCAL_POLICY.writer == "lcp"
+
+
+def test_a_target_whose_patch_has_its_anchor_behind_a_wall_is_approached_from_its_own_side() -> None:
+    """Column 5 is anchored on this side of a wall, the target lies beyond it: the way goes round, over row 5."""
+    lattice = corridor({})
+    irm = _walled(lattice)
+    target = (IX0 + 5.6, IY0 + 4.9)
+    policy = global_policy([at(4), target])
+    assert _columns(way_along(irm, policy, 4 * SIZE + 4, 1.0, 0.9), 4 * SIZE + 4)[-1] == (6, 5)
+    assert way_along(irm, policy, 5 * SIZE + 6, 1.0, 0.9) == [], "it is there; it is not sent to and fro"
+
+
+def _walled(lattice: Reference) -> LocalIrm:
+    """Rows 4 and 5 join at column 4; in row 4 column 5 is a dead end, in row 5 the way goes on to column 6."""
+    irm = local_irm(lattice)
+    n = lattice.size**2
+    edges = np.zeros((n, 8), np.float32)
+    for (column, row), k in {(3, 4): 0, (4, 4): 0, (4, 5): 0, (5, 5): 0}.items():
+        edges[row * SIZE + column, k] = edges[row * SIZE + column + 1, (k + 4) % 8] = 1.0
+    edges[4 * SIZE + 4, 2] = edges[5 * SIZE + 4, 6] = 1.0
+    anchor = irm.anchor_m.copy()
+    anchor[4 * SIZE + 5] = (IX0 + 5.02, IY0 + 4.02)
+    anchor[5 * SIZE + 5] = (IX0 + 5.1, IY0 + 5.9)
+    anchor[5 * SIZE + 6] = (IX0 + 6.0, IY0 + 5.2)
+    state = np.where((edges > 0.0).any(axis=1), 1, 2).astype(np.uint8)
+    return irm.model_copy(
+        update={
+            "edge_distance_m": edges,
+            "edge_risk": np.zeros((n, 8), np.float32),
+            "anchor_m": anchor,
+            "state": state,
+        }
+    )
+
+
+def _columns(moves: list[int], node: int) -> list[tuple[int, int]]:
+    places = []
+    for k in moves:
+        node = neighbour(node, k, SIZE)
+        places.append((node % SIZE, node // SIZE))
+    return places

@@ -200,6 +200,24 @@ def test_ground_that_rises_is_no_ceiling_of_itself() -> None:
     assert near == [FREE] * 4
 
 
+def test_ground_once_seen_is_not_taken_for_overhead_when_what_leads_there_is_missed() -> None:
+    """The far part of a ramp, seen a few times, and then by a sweep that lost the rings before it."""
+    y = np.arange(-0.5, 0.5, 0.2)
+
+    def slope(*xs: float) -> NDArray[np.float64]:
+        return np.concatenate(
+            [np.stack([0.0 * y + x, y, 0.0 * y + max(0.0, 0.5 * (x - 4.0))], axis=1) for x in xs]
+        )
+
+    model = TerrainModel(config(profile="spot"))
+    for k in range(2):
+        model.integrate(sparse_cloud(slope(*np.arange(2.0, 9.0, 0.05)), 2 * k + 1))
+        model.integrate(sparse_cloud(slope(3.0, 3.9, 8.05), 2 * k + 2))
+    assert at(model, cells_of(model)[SEEN], 8.05, 0.1) > 0
+    assert at(model, cells_of(model)[CEILING_SEEN], 8.05, 0.1) == 0
+    assert at(model, layers_of(model, Pose()).state, 8.05, 0.1) == FREE
+
+
 def test_a_beam_below_the_robots_height_is_an_obstacle() -> None:
     points = [(4.0 + 0.02 * k, 0.005 * j, 0.0) for k in range(5) for j in range(5)]
     beam = [(4.05, 0.005 * j, 0.7) for j in range(5)]
