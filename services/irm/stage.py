@@ -13,7 +13,7 @@ from planning.grid import UNKNOWN
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.operation import MissionPhase
-from schemas.policy import GlobalPolicy
+from schemas.policy import LocalPhase
 from schemas.sensing import CoverageScan, Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import (
@@ -25,6 +25,7 @@ from schemas.topics import (
     GLOBAL_IRM,
     GLOBAL_POLICY,
     LOCAL_IRM,
+    LOCAL_POLICY,
     MISSION,
     MISSION_GRAPH_REQUEST,
     ODOMETRY,
@@ -53,6 +54,7 @@ _BLOCKED_MOST = 2
 """and so often at most: a door that was touched is risky, not shut."""
 _DOUBT_WINDOWS = 1.25
 """Keyframes within so many widths of the window are asked for their certainty: what they saw may lie in it."""
+_HELPLESS_TIMES = 6.0
 _MAX_PENDING = 50
 _MOVES_MPS = 0.02
 _PROGRESS_M2 = 0.3
@@ -126,8 +128,7 @@ class IrmStage:
         ]
         due = now - self._global_ns >= self._config.global_period_s * SECOND_NS - SECOND_NS // 100
         if due or asked:
-            policy = inputs.current(GLOBAL_POLICY)
-            found += self._global(now, window, odometry, bool(asked), policy, _exploring(inputs))
+            found += self._global(now, window, odometry, bool(asked), inputs)
         return found
 
     def _allocate(self, risk: RiskMap) -> None:
@@ -231,13 +232,14 @@ class IrmStage:
         window: Window,
         odometry: Odometry,
         whole: bool,
-        policy: GlobalPolicy | None,
-        exploring: bool,
+        inputs: Inputs,
     ) -> Outputs:
         # Neither the first round, nor a gap in the inputs, nor a pause is time that the robot stood beside a frontier.
         since = (now - self._global_ns) / SECOND_NS
         elapsed = (
-            min(since, 2.0 * self._config.global_period_s) if self._global_ns >= 0 and exploring else 0.0
+            min(since, 2.0 * self._config.global_period_s)
+            if self._global_ns >= 0 and _exploring(inputs)
+            else 0.0
         )
         self._global_ns = now
         place = self._place(odometry)
@@ -249,8 +251,7 @@ class IrmStage:
         if covered_m2 >= self._covered_m2 + _PROGRESS_M2:
             self._covered_m2 = covered_m2
             self._roadmap.manager.progressed()
-        if policy is not None:
-            self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, elapsed)
+        self._pursue(now, inputs, elapsed)
         self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, ground_m2, anchor, self._doubtful)
         first = self._roadmap.version == 0
         message = self._roadmap.message(odometry.pose, self._frame_pose(odometry), now, whole or first)
@@ -261,6 +262,16 @@ class IrmStage:
             Output(COVERAGE, self._summary(now, ground_m2, covered_m2)),
             Output(COVERAGE_WINDOW, CoverageWindow(stamp_ns=now, grid=header, cell=picture)),
         ]
+
+    def _pursue(self, now: Stamp, inputs: Inputs, elapsed_s: float) -> None:
+        """The time that the robot has been after its target; where the local planner finds no way there, it goes on
+        several times as fast: the robot would only go to and fro."""
+        policy, local = inputs.current(GLOBAL_POLICY), inputs.current(LOCAL_POLICY)
+        if policy is None:
+            return
+        helpless = local is not None and local.phase == LocalPhase.NONE and local.target == policy.target
+        times = _HELPLESS_TIMES if helpless and policy.target >= 0 else 1.0
+        self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, times * elapsed_s)
 
     def _frame_pose(self, odometry: Odometry) -> Pose:
         """Pose of `odom` in `map` that the graph goes by."""
