@@ -11,7 +11,7 @@ world[20, :60] = world[40, 20:] = True
 known = np.full(world.shape, -1, np.int8)  # -1 unknown, 0 free, 100 occupied
 x, y, yaw = 1.5, 1.5, 0.0
 explorer = Explorer({"coverage": "known", "sensor_range_m": 5.0, "sensor_fov_deg": 360.0})
-for step in range(200):
+for step in range(200):  # noqa: B007
     seen = np.zeros(world.shape, np.uint8)  # what the robot's own sensor sees from here
     visible_cells(world, x / 0.2, y / 0.2, 5.0 / 0.2, yaw, 2 * np.pi, seen)
     around = np.pad(seen, 1)

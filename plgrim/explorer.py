@@ -6,7 +6,6 @@ No Zenoh, no processes, no clock: `Explorer(config).step(grid_or_cloud, pose)` g
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,7 +36,7 @@ from schemas.contract import SECOND_NS, Stage, StageSetup, StageSpec, Stamp, Top
 from schemas.operation import FinishReason, MissionState
 from schemas.policy import Alternative, GlobalPolicy, LocalPhase, LocalPolicy
 from schemas.policy import Plan as WirePlan
-from schemas.snapshot import pack_snapshot, unpack_snapshot
+from schemas.snapshot import pack_message, pack_snapshot, unpack_message, unpack_snapshot
 from schemas.topics import (
     CLOUD,
     COVERAGE,
@@ -83,7 +82,9 @@ class ExplorerConfig(BaseModel):
     sensor_range_m: float = Field(6.0, gt=0, le=45, description="Range of the coverage sensor, m.")
     sensor_fov_deg: float = Field(120.0, gt=0, le=360, description="Field of view of the coverage sensor.")
     detection_probability: float = Field(0.95, gt=0.5, lt=1, description="Of what lies in its view.")
-    keyframe_spacing_m: float = Field(1.0, gt=0, le=20, description="Looks hang on keyframes so far apart, m.")
+    keyframe_spacing_m: float = Field(
+        1.0, gt=0, le=20, description="Looks hang on keyframes so far apart, m."
+    )
     profile: Literal["husky", "spot"] = Field("spot", description="The robot's body; riskmap may differ.")
     seed: int = Field(1, ge=0, lt=2**63, description="Of every random stream.")
     riskmap: dict[str, Any] = Field(default_factory=dict, description="resolution_m: default, the grid's.")
@@ -179,6 +180,19 @@ class _Heard:
         self.local: LocalPolicy | None = None
         self.mission: MissionState | None = None
         self.coverage: CoverageSummary | None = None
+
+    def state(self) -> dict[str, bytes]:
+        """For a snapshot."""
+        return {name: pack_message(held) for name, held in vars(self).items() if held is not None}
+
+    def load(self, state: Mapping[str, bytes]) -> None:
+        """Go on from `state`."""
+        kinds: dict[str, type[Message]] = {
+            "plan": WirePlan, "policy": GlobalPolicy, "local": LocalPolicy, "mission": MissionState,
+            "coverage": CoverageSummary,
+        }  # fmt: skip
+        for name, packed in state.items():
+            setattr(self, name, unpack_message(packed, kinds[name]))
 
     def __call__(self, topic: Topic[Message], message: Message, now: Stamp) -> None:
         match message:
@@ -312,7 +326,8 @@ class Explorer:
         """Everything that is needed to go on, in this or another process."""
         run = b"" if self._lockstep is None else self._lockstep.snapshot()
         last = None if self._last is None else list(self._last)
-        return pack_snapshot({"run": run, "resolution_m": self._resolution_m, "last": last})
+        held = {"run": run, "resolution_m": self._resolution_m, "last": last, "heard": self._heard.state()}
+        return pack_snapshot(held)
 
     def restore(self, snapshot: bytes) -> None:
         """Go on from a snapshot of an explorer with the same configuration. Raises MalformedError, KeyError."""
@@ -325,3 +340,4 @@ class Explorer:
             self._start(state["resolution_m"])
             assert self._lockstep is not None
             self._lockstep.restore(state["run"])
+        self._heard.load(state["heard"])

@@ -120,7 +120,9 @@ def _numbers(name: str, values: Any, counts: tuple[int, ...]) -> tuple[float, ..
     except (TypeError, ValueError) as error:
         raise ExplorerInputError(f"{name}: numbers are wanted, got {values!r}") from error
     if len(numbers) not in counts or not all(map(math.isfinite, numbers)):
-        raise ExplorerInputError(f"{name}: {' or '.join(map(str, counts))} finite numbers are wanted: {values!r}")
+        raise ExplorerInputError(
+            f"{name}: {' or '.join(map(str, counts))} finite numbers are wanted: {values!r}"
+        )
     return numbers
 
 

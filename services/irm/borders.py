@@ -78,9 +78,7 @@ def find_frontiers(window: Window, config: Config, least: float | None = None) -
     return _select(gain, opening, places, piece_of, window, least)
 
 
-def _find_behind(
-    window: Window, config: Config, labels: NDArray[np.int32], least: float
-) -> list[Found]:
+def _find_behind(window: Window, config: Config, labels: NDArray[np.int32], least: float) -> list[Found]:
     """The frontiers of `coverage: known`: blocks of the unknown behind the border, each with its expected gain."""
     s, wanted = window.spec, window.uncovered
     pieces = label_components(wanted, labels)

@@ -1,4 +1,4 @@
-"""The planner as a library: it explores somebody else's map, deterministically, and says what is wrong with an input."""
+"""The planner as a library: it explores somebody else's map, deterministically, and names what is wrong."""
 
 from __future__ import annotations
 
@@ -115,7 +115,9 @@ def test_same_inputs_same_bytes_and_a_snapshot_goes_on() -> None:
 
 def test_a_cloud_is_taken() -> None:
     angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
-    wall = np.minimum(4.0 / np.maximum(np.abs(np.cos(angles)), 1e-9), 3.0 / np.maximum(np.abs(np.sin(angles)), 1e-9))
+    wall = np.minimum(
+        4.0 / np.maximum(np.abs(np.cos(angles)), 1e-9), 3.0 / np.maximum(np.abs(np.sin(angles)), 1e-9)
+    )
     points = np.stack([wall * np.cos(angles), wall * np.sin(angles), np.full(720, -0.4)], axis=1)
     explorer = Explorer(options(riskmap={"window_m": 20.0}))
     for _ in range(2):
