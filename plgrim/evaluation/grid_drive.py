@@ -16,10 +16,10 @@ from plgrim.evaluation.grid_peers import best_node, nearest
 from plgrim.evaluation.grid_rules import GridWorld, Rules, first_move
 from plgrim.explorer import Explorer, ExplorerConfig, Grid, Plan
 
-CELL_M = {"ariadne": 0.25, "dare": 0.4}
-"""Metres a cell: the sensor of both looks 20 m."""
-_AHEAD = 2.0
-"""The place of the path that is driven for lies so many steps of the lattice ahead."""
+CELL_M = {"ariadne": 0.15, "dare": 0.24}
+"""Planner's metres a cell: the sensor of both looks 12 m, and a step of either lattice is about one of the Local IRM."""
+_AHEAD = 1.0
+"""The place of the path that is driven for lies so many (shortest) steps of the lattice ahead."""
 _MOST_MOVES = 1500
 _NOTHING_NEW_CELLS = 20
 _AGAIN = 3
