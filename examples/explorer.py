@@ -9,9 +9,10 @@ world = np.zeros((60, 80), bool)  # True: wall; cells of 0.2 m
 world[[0, -1]] = world[:, [0, -1]] = True
 world[20, :60] = world[40, 20:] = True
 known = np.full(world.shape, -1, np.int8)  # -1 unknown, 0 free, 100 occupied
-x, y, yaw = 1.5, 1.5, 0.0
+x, y, yaw, steps = 1.5, 1.5, 0.0, 0
 explorer = Explorer({"coverage": "known", "sensor_range_m": 5.0, "sensor_fov_deg": 360.0})
-for step in range(200):  # noqa: B007
+while steps < 200:
+    steps += 1
     seen = np.zeros(world.shape, np.uint8)  # what the robot's own sensor sees from here
     visible_cells(world, x / 0.2, y / 0.2, 5.0 / 0.2, yaw, 2 * np.pi, seen)
     around = np.pad(seen, 1)
@@ -21,5 +22,5 @@ for step in range(200):  # noqa: B007
     if plan.finished:
         break
     if plan.moves:  # drive for a second
-        x, y, yaw, _ = plan.path[min(np.searchsorted(plan.path[:, 3], 1.0), len(plan.path) - 1)]
-print(f"{plan.finish}: {plan.covered_area_m2:.0f} m2 known after {step} steps")
+        x, y, yaw, _ = plan.after(1.0)
+print(f"{plan.finish}: {plan.covered_area_m2:.0f} m2 known after {steps} steps")

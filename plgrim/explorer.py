@@ -170,6 +170,14 @@ class Plan:
         """Whether there is somewhere to drive."""
         return len(self.path) > 1
 
+    def after(self, seconds: float) -> Pose:
+        """The pose on the path after so many seconds, at its end when it is shorter. Raises ValueError when empty."""
+        if not len(self.path):
+            raise ValueError("the plan has no path: the robot is to stand")
+        at = min(int(np.searchsorted(self.path[:, 3], seconds)), len(self.path) - 1)
+        x_m, y_m, yaw_rad, _ = self.path[at].tolist()
+        return Pose(x_m, y_m, yaw_rad)
+
 
 class _Heard:
     """The newest message of each kind that a plan is made of."""
@@ -266,11 +274,10 @@ class Explorer:
         if not isinstance(seen, Grid | Cloud):
             raise ExplorerInputError(f"seen: a Grid or a Cloud is wanted, got {type(seen).__name__}")
         if self._lockstep is None:
-            self._start(seen.resolution_m if isinstance(seen, Grid) else _FINEST_M)
-        assert self._lockstep is not None
+            return self._start(seen.resolution_m if isinstance(seen, Grid) else _FINEST_M)
         return self._lockstep
 
-    def _start(self, resolution_m: float) -> None:
+    def _start(self, resolution_m: float) -> Lockstep:
         self._resolution_m = resolution_m
         stages: dict[str, tuple[StageSpec, Stage]] = {}
         for service, triggers in _TRIGGERS.items():
@@ -280,6 +287,7 @@ class Explorer:
         stages["sim"] = FEED_SPEC, self._sensors
         self._lockstep = Lockstep({}, self.config.seed, observer=self._heard, stages=(), extra=stages)
         self._lockstep.run_until(0)
+        return self._lockstep
 
     def _check(self, service: str, resolution_m: float) -> dict[str, Any]:
         options, model = self.config.options(service, resolution_m), stage_module(service).Config
@@ -337,7 +345,5 @@ class Explorer:
         self._lockstep = None
         self._last = None if state["last"] is None else Pose(*state["last"])
         if state["run"]:
-            self._start(state["resolution_m"])
-            assert self._lockstep is not None
-            self._lockstep.restore(state["run"])
+            self._start(state["resolution_m"]).restore(state["run"])
         self._heard.load(state["heard"])

@@ -43,7 +43,7 @@ class Grid:
     origin_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.resolution_m, int | float) and 0.005 < self.resolution_m <= 10.0):
+        if not 0.005 < self.resolution_m <= 10.0:
             raise ExplorerInputError(
                 f"grid.resolution_m: {self.resolution_m!r} is not in (0.005, 10] metres a cell"
             )

@@ -1,4 +1,4 @@
-"""PLGRIM under the grid protocols: the five stages plan, and what they chose is projected onto the protocol's lattice."""
+"""PLGRIM under the grid protocols: the five stages plan, their motion is projected onto its lattice."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from plgrim.evaluation.grid_rules import GridWorld, Rules, first_move
 from plgrim.explorer import Explorer, ExplorerConfig, Grid, Plan
 
 CELL_M = {"ariadne": 0.15, "dare": 0.24}
-"""Planner's metres a cell: the sensor of both looks 12 m, and a step of either lattice is about one of the Local IRM."""
+"""Planner's metres a cell: the sensor of both looks 12 m, a step of either lattice is about one of the Local IRM."""
+_BLOCK = {"ariadne": 2, "dare": 1}
+"""Cells a side of what the planner gets as one cell (ARiADNE's own frontiers lie on blocks of 4)."""
 _AHEAD = 1.0
 """The place of the path that is driven for lies so many (shortest) steps of the lattice ahead."""
 _MOST_MOVES = 1500
@@ -40,8 +42,12 @@ class Drive:
     notes: list[str] = field(default_factory=list)
 
 
-def occupancy(belief: NDArray[np.uint8]) -> NDArray[np.int8]:
-    """The protocol's belief as an occupancy grid."""
+def occupancy(belief: NDArray[np.uint8], block: int = 1) -> NDArray[np.int8]:
+    """The protocol's belief as an occupancy grid, in blocks: occupied if any cell is, free if all are."""
+    if block > 1:
+        rows, columns = belief.shape[0] // block, belief.shape[1] // block
+        pieces = belief[: rows * block, : columns * block].reshape(rows, block, columns, block)
+        belief = pieces.min(axis=(1, 3))
     cells = np.full(belief.shape, -1, np.int8)
     cells[belief == OPEN], cells[belief == SOLID] = 0, 100
     return cells
@@ -123,16 +129,16 @@ class Projection:
         return min(edges.values(), default=1.0) / self._world.cell * self._cell_m
 
 
-def drive(world: GridWorld, rules: Rules, parameters: ExplorerConfig) -> Drive:
+def drive(world: GridWorld, rules: Rules, parameters: ExplorerConfig, most_moves: int = _MOST_MOVES) -> Drive:
     """Explore a map to the protocol's end (or until no useful node can be reached)."""
-    cell_m = CELL_M[rules]
+    cell_m, block = CELL_M[rules], _BLOCK[rules]
     explorer, projection = Explorer(parameters), Projection(world, cell_m)
     track, plan_s, notes = [world.node[world.at].tolist()], [], []
     yaw, seconds, over = 0.0, parameters.seconds_per_step, False
-    while not world.done and world.moves < _MOST_MOVES:
+    while not world.done and world.moves < most_moves:
         x_m, y_m = ((world.node[world.at] + 0.5) * cell_m).tolist()
         began = time.perf_counter()
-        plan = explorer.step(Grid(occupancy(world.belief), cell_m), (x_m, y_m, yaw), seconds)
+        plan = explorer.step(Grid(occupancy(world.belief, block), cell_m * block), (x_m, y_m, yaw), seconds)
         plan_s.append(time.perf_counter() - began)
         if plan.finished and not over:
             over = True

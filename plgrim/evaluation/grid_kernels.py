@@ -15,7 +15,12 @@ UNSEEN, SOLID, OPEN = np.uint8(127), np.uint8(1), np.uint8(255)
 
 @njit
 def scan(
-    truth: NDArray[np.uint8], belief: NDArray[np.uint8], x0: int, y0: int, ray_end: NDArray[np.int64], depth: int
+    truth: NDArray[np.uint8],
+    belief: NDArray[np.uint8],
+    x0: int,
+    y0: int,
+    ray_end: NDArray[np.int64],
+    depth: int,
 ) -> None:
     """One scan: each ray marks free cells, and up to `depth` wall cells where it meets a wall.
 

@@ -21,7 +21,7 @@ def nearest(travel: NDArray[np.float64], utility: NDArray[np.int64]) -> NDArray[
 
 def discounted_utility(travel: NDArray[np.float64], utility: NDArray[np.int64]) -> NDArray[np.float64]:
     """Utility times exp(-travel / 160)."""
-    return utility * np.exp(-travel / 160.0)
+    return utility.astype(np.float64) * np.exp(-travel / 160.0)
 
 
 def explore(world: GridWorld, score: Score, most_moves: int = _MOST_MOVES) -> bool:

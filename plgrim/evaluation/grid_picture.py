@@ -32,7 +32,9 @@ def grid_picture(
     axes.imshow(shade, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
     points = track.astype(float)
     pieces = np.stack([points[:-1], points[1:]], axis=1)
-    axes.add_collection(LineCollection(pieces, array=np.arange(len(pieces)), cmap="turbo", linewidths=1.8))
+    axes.add_collection(
+        LineCollection(list(pieces), array=np.arange(len(pieces)), cmap="turbo", linewidths=1.8)
+    )
     for i in range(0, len(points), 5):
         axes.annotate(str(i), tuple(points[i]), fontsize=7)
     axes.plot(*points[0], "o", color="tab:blue")

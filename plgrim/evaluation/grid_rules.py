@@ -90,7 +90,9 @@ def _truth(free: NDArray[np.bool_]) -> NDArray[np.uint8]:
 def _start(name: str, gray: NDArray[np.int64], index: int) -> tuple[int, int]:
     rows, columns = np.nonzero(gray == MARKER)
     if len(rows) <= index:
-        raise MapError(f"{name}: {len(rows)} cells of the start marker (gray {MARKER}), {index + 1} are wanted")
+        raise MapError(
+            f"{name}: {len(rows)} cells of the start marker (gray {MARKER}), {index + 1} are wanted"
+        )
     return int(columns[index]), int(rows[index])
 
 
@@ -256,7 +258,13 @@ class AriadneWorld(GridWorld):
     def _sight(self, cells: NDArray[np.int64], part: slice) -> NDArray[np.bool_]:
         seen = np.zeros((len(self.node[part]), len(cells)), np.bool_)
         in_sight(
-            self.belief, self.node[part], cells, self.place[part], cells.astype(np.float64), self.utility_range, seen
+            self.belief,
+            self.node[part],
+            cells,
+            self.place[part],
+            cells.astype(np.float64),
+            self.utility_range,
+            seen,
         )
         return seen
 

@@ -40,6 +40,10 @@ class Config(BaseModel):
     unknown_decay_m: float = Field(
         4.0, gt=0, le=1000, description="less with its depth: exp(-depth / this), m."
     )
+    unknown_solid: bool = Field(
+        True,
+        description="Unseen cells count amid unseen ones only: gaps between far rays are none. False: all.",
+    )
     # coverage sensor, as the planners assume it
     sensor_range_m: float = Field(6.0, gt=0, le=100, description="Range of the coverage sensor, m.")
     sensor_fov_deg: float = Field(120.0, gt=0, le=360, description="Field of view of the coverage sensor.")

@@ -153,7 +153,7 @@ def build_window(
     layer[risk.state != UNKNOWN] = KNOWN
     layer[ground] = GROUND
     unseen = layer == 0
-    hopeful = solid(unseen) & (risk.clearance_m >= needed)
+    hopeful = (solid(unseen) if config.unknown_solid else unseen) & (risk.clearance_m >= needed)
     hopeful &= connected_free_space(reachable | hopeful, robot)
     cell_share = (g.resolution_m / config.spacing_m) ** 2
     if config.coverage == "known":

@@ -51,8 +51,7 @@ class Robot:
         plan = self.explorer.step(Grid(self.known, RESOLUTION_M), self.pose)
         if plan.moves:
             assert np.all(np.diff(plan.path[:, 3]) >= 0.0)
-            row = plan.path[min(int(np.searchsorted(plan.path[:, 3], 1.0)), len(plan.path) - 1)]
-            self.pose = (float(row[0]), float(row[1]), float(row[2]))
+            self.pose = plan.after(1.0)[:3]
         return plan
 
 
