@@ -20,8 +20,10 @@ CELL_M = {"ariadne": 0.15, "dare": 0.24}
 """Planner's metres a cell: the sensor of both looks 12 m, a step of either lattice is about one of the Local IRM."""
 _BLOCK = {"ariadne": 2, "dare": 1}
 """Cells a side of what the planner gets as one cell (ARiADNE's own frontiers lie on blocks of 4)."""
-_AHEAD = 1.0
-"""The place of the path that is driven for lies so many (shortest) steps of the lattice ahead."""
+_REACH = 2.5
+"""So many (shortest) steps of the lattice of the path count for an edge."""
+_OFF_PATH = 2.0
+"""Metres of progress that one metre beside the path costs."""
 _MOST_MOVES = 1500
 _NOTHING_NEW_CELLS = 20
 _AGAIN = 3
@@ -56,8 +58,10 @@ def occupancy(belief: NDArray[np.uint8], block: int = 1) -> NDArray[np.int8]:
 class Projection:
     """From a planned path to the next node of the protocol's lattice.
 
-    The goal is the node nearest to a place of the path some way ahead; the robot takes the first edge of the lattice's
-    shortest way there. When that leads straight back and the last move has shown nothing new, it goes on to the goal
+    The edge from the robot's node that follows the path best and farthest is taken: progress along the path, less what
+    its end lies off the path and what it is longer than the path. Where no edge does, the goal is the node nearest to
+    the path some way ahead, else to the global target, by the lattice's shortest way. When a move leads straight back
+    and the last one has shown nothing new, the robot goes on to the goal
     before, so that two plans of equal worth do not send it to and fro.
     """
 
@@ -109,8 +113,11 @@ class Projection:
         if not others.any():
             return -1, ""
         if plan.moves:
-            ahead_m = _AHEAD * self._step_m()
             along = np.concatenate([[0.0], np.hypot(*np.diff(plan.path[:, :2], axis=0).T).cumsum()])
+            edge = self._best_edge(plan.path[:, :2], along, place_m)
+            if edge >= 0:
+                return edge, "path"
+            ahead_m = self._step_m()
             for at in range(int(np.searchsorted(along, min(ahead_m, along[-1]))), len(along)):
                 away = np.hypot(*(place_m - plan.path[at, :2]).T)
                 nearest_node = int(np.argmin(np.where(np.isfinite(travel), away, math.inf)))
@@ -122,6 +129,21 @@ class Projection:
             if nearest_node != world.at:
                 return nearest_node, "target"
         return -1, ""
+
+    def _best_edge(
+        self, path_m: NDArray[np.float64], along_m: NDArray[np.float64], place_m: NDArray[np.float64]
+    ) -> int:
+        """The neighbour that is best reached by the path's beginning; -1 when none is."""
+        most = int(np.searchsorted(along_m, _REACH * self._step_m()))
+        best, best_score = -1, 0.0
+        for node, length in sorted(self._world.edges.get(self._world.at, {}).items()):
+            off = np.hypot(*(path_m[:most] - place_m[node]).T)
+            length_m = length / self._world.cell * self._cell_m
+            score = float((along_m[:most] - _OFF_PATH * off).max(initial=-math.inf))
+            score -= max(0.0, length_m - along_m[min(most, len(along_m) - 1)])
+            if score > best_score:
+                best, best_score = node, score
+        return best
 
     def _step_m(self) -> float:
         """A usual step of the lattice from here, m."""
