@@ -20,7 +20,7 @@ CELL_M = {"ariadne": 0.15, "dare": 0.24}
 """Planner's metres a cell: the sensor of both looks 12 m, a step of either lattice is about one of the Local IRM."""
 _BLOCK = {"ariadne": 2, "dare": 1}
 """Cells a side of what the planner gets as one cell (ARiADNE's own frontiers lie on blocks of 4)."""
-_REACH = 2.5
+_REACH = 1.8
 """So many (shortest) steps of the lattice of the path count for an edge."""
 _OFF_PATH = 2.0
 """Metres of progress that one metre beside the path costs."""
