@@ -113,7 +113,8 @@ class Projection:
         if not others.any():
             return -1, ""
         if plan.moves:
-            along = np.concatenate([[0.0], np.hypot(*np.diff(plan.path[:, :2], axis=0).T).cumsum()])
+            steps = np.hypot(*np.diff(plan.path[:, :2], axis=0).T)
+            along: NDArray[np.float64] = np.concatenate([np.zeros(1), steps.cumsum()]).astype(np.float64)
             edge = self._best_edge(plan.path[:, :2], along, place_m)
             if edge >= 0:
                 return edge, "path"

@@ -23,7 +23,7 @@ from plgrim.runtime.process import THREAD_LIMITS
 PARAMETERS = Path(__file__).with_name("grid_parameters.yaml")
 ROWS_FILE, SUMMARY_FILE = "maps.csv", "summary.md"
 COLUMNS = (
-    "set", "map", "travel", "ratio", "reference", "ratio_utility_here", "utility_here", "known_map_tour", "moves",
+    "set", "map", "travel", "ratio", "reference", "ratio_rule_here", "rule_here", "known_map_tour", "moves",
     "finished", "unseen_cells", "moves_by_path", "moves_by_target", "moves_goal_kept", "moves_by_protocol",
     "plan_ms_p50", "plan_ms_p99", "wall_s", "notes",
 )  # fmt: skip
@@ -110,19 +110,19 @@ def plan_tasks(
 def run_map(task: Task) -> dict[str, Any]:
     """Drive one map, write its result (and picture), and give its row."""
     from plgrim.evaluation.grid_drive import drive, milliseconds
-    from plgrim.evaluation.grid_peers import discounted_utility, explore
+    from plgrim.evaluation.grid_peers import discounted_utility, explore, nearest
     from plgrim.evaluation.grid_rules import make_world, read_map
     from plgrim.explorer import ExplorerConfig
 
     began = time.monotonic()
     grid = read_map(task.image, task.rules)
     rule = make_world(grid, task.rules)
-    explore(rule, discounted_utility)
+    explore(rule, discounted_utility if task.rules == "ariadne" else nearest)
     found = drive(make_world(grid, task.rules), task.rules, ExplorerConfig.of(task.parameters))
     row: dict[str, Any] = {
         "set": task.group, "map": task.image.name, "travel": round(found.travelled, 2),
         "reference": task.reference, "ratio": found.travelled / task.reference,
-        "utility_here": round(rule.travelled, 2), "ratio_utility_here": found.travelled / rule.travelled,
+        "rule_here": round(rule.travelled, 2), "ratio_rule_here": found.travelled / rule.travelled,
         "known_map_tour": task.tour, "moves": found.moves, "finished": found.finished,
         "unseen_cells": found.unseen_cells, **{column: found.how.get(how, 0) for how, column in _HOW.items()},
         **milliseconds(found.plan_s), "wall_s": round(time.monotonic() - began, 1), "notes": "; ".join(found.notes),
@@ -214,10 +214,10 @@ def summary(rows: list[Mapping[str, Any]], rules: Rules, command: str) -> str:
         "",
         f"`{command}`",
         "",
-        f"Ratio: our travel over that of {against}, mean over maps, 95 % bootstrap interval. Utility: the peers' rule "
-        "run here, on the same maps. Moves by the protocol: moves to the nearest useful node where PLGRIM had none.",
+        f"Ratio: our travel over that of {against}, mean over maps, 95 % bootstrap interval. Rule: the peers' "
+        f"{'utility times exp(-d / 160)' if rules == 'ariadne' else 'nearest useful node'}, run here. Moves by the protocol: moves to the nearest useful node where PLGRIM had none.",
         "",
-        f"| set | maps | finished | travel, {_UNIT[rules]} | ratio | ratio to utility | worst | "
+        f"| set | maps | finished | travel, {_UNIT[rules]} | ratio | ratio to the rule | worst | "
         "moves by the protocol | plan p50 / p99, ms |",
         "|-|-|-|-|-|-|-|-|-|",
     ]
@@ -235,10 +235,11 @@ def _line(name: str, rows: list[Mapping[str, Any]], rules: Rules) -> str:
     from plgrim.evaluation.statistics import bootstrap_mean
 
     cells = []
-    for column in ("ratio", "ratio_utility_here"):
+    for column in ("ratio", "ratio_rule_here"):
         values = [float(row[column]) for row in rows if math.isfinite(float(row[column]))]
         found = bootstrap_mean(values, "grid", rules, name, column)
-        cells.append(f"{found.mean:.3f} [{found.low:.3f}, {found.high:.3f}]" if values else "-")
+        interval = f" [{found.low:.3f}, {found.high:.3f}]" if math.isfinite(found.low) else ""
+        cells.append(f"{found.mean:.3f}{interval}" if values else "-")
     worst = max((float(row["ratio"]) for row in rows), default=math.nan)
     travel = sum(float(row["travel"]) for row in rows) / len(rows)
     moves = sum(int(row["moves"]) for row in rows)
