@@ -208,6 +208,7 @@ def write_tables(rows: Iterable[Mapping[str, Any]], rules: Rules, out: Path, com
 
 def summary(rows: list[Mapping[str, Any]], rules: Rules, command: str) -> str:
     """Mean ratios with bootstrap intervals, by set and over all, as Markdown."""
+    rule = "utility times exp(-d / 160)" if rules == "ariadne" else "nearest useful node"
     against = "the better of utility and set cover + TSP" if rules == "ariadne" else "the TARE port"
     lines = [
         f"# Grid protocol: {rules}",
@@ -215,7 +216,7 @@ def summary(rows: list[Mapping[str, Any]], rules: Rules, command: str) -> str:
         f"`{command}`",
         "",
         f"Ratio: our travel over that of {against}, mean over maps, 95 % bootstrap interval. Rule: the peers' "
-        f"{'utility times exp(-d / 160)' if rules == 'ariadne' else 'nearest useful node'}, run here. Moves by the protocol: moves to the nearest useful node where PLGRIM had none.",
+        f"{rule}, run here. Moves by the protocol: to the nearest useful node, where PLGRIM had none.",
         "",
         f"| set | maps | finished | travel, {_UNIT[rules]} | ratio | ratio to the rule | worst | "
         "moves by the protocol | plan p50 / p99, ms |",
