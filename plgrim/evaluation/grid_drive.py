@@ -114,8 +114,8 @@ class Projection:
             return -1, ""
         if plan.moves:
             steps = np.hypot(*np.diff(plan.path[:, :2], axis=0).T)
-            along: NDArray[np.float64] = np.concatenate([np.zeros(1), steps.cumsum()]).astype(np.float64)
-            edge = self._best_edge(plan.path[:, :2], along, place_m)
+            along = np.concatenate([np.zeros(1), steps.cumsum()])
+            edge = self._best_edge(plan.path[:, :2], along, np.asarray(place_m, np.float64))
             if edge >= 0:
                 return edge, "path"
             ahead_m = self._step_m()
