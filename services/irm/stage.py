@@ -44,6 +44,7 @@ from services.irm.out_of_reach import TOO_NARROW, OutOfReach
 from services.irm.resample import moved
 from services.irm.roadmap import Roadmap
 from services.irm.tiles import TileLayer
+from services.irm.unknown import expected_area_m2
 from services.irm.window import Window, build_window, grid_of, read_layer, relief_of, window_picture
 
 __all__ = ["Config", "IrmStage", "create", "spec"]
@@ -141,7 +142,8 @@ class IrmStage:
         self._coverage = TileLayer("float32", 0.0, resolution_m)
         self._store = FootprintStore(self._coverage)
         self._ground_store = GroundStore(self._ground)
-        self._areas = Areas(self._ground, self._coverage, math.log(p / (1.0 - p)))
+        bound = -math.inf if self._config.coverage == "known" else math.log(p / (1.0 - p))
+        self._areas = Areas(self._ground, self._coverage, bound)
         self._local = LocalIrmBuilder(self._config, radius_m, version)
 
     def _read_pose_graph(self, inputs: Inputs) -> None:
@@ -282,15 +284,18 @@ class IrmStage:
         given_up = [(g.x_m, g.y_m, g.gain, g.reason) for g in self._roadmap.manager.given_up]
         given_up += [(p.x_m, p.y_m, p.gain, TOO_NARROW) for p in self._out_of_reach.places]
         frontiers = self._roadmap.manager.frontiers
+        left = float(sum(f.gain for f in frontiers.values()))
+        if self._config.coverage == "known":  # what is known is covered; what is expected behind it is not
+            reachable += expected_area_m2(left, self._config.spacing_m)
         return CoverageSummary(
             stamp_ns=now,
             irm_version=max(self._roadmap.version, 1),
             reachable_area_m2=reachable,
             covered_area_m2=covered,
             covered_fraction=covered / reachable if reachable else 0.0,
-            entropy_left=float(sum(f.gain for f in frontiers.values())) + self._roadmap.manager.dropped_gain,
+            entropy_left=left + self._roadmap.manager.dropped_gain,
             frontiers=len(frontiers),
-            frontier_gain=float(sum(f.gain for f in frontiers.values())),
+            frontier_gain=left,
             breadcrumbs=self._roadmap.breadcrumbs(),
             settled=not frontiers and reachable > 0.0,
             unreachable_xy_m=np.array([place[:2] for place in given_up], dtype=np.float64).reshape(-1, 2),
