@@ -156,7 +156,7 @@ def find_child(tree: Tree, branch: int, observation: int) -> int:
 
 
 @njit_borrowing
-def _add_child(tree: Tree, branch: int, observation: int) -> int:
+def new_child(tree: Tree, branch: int, observation: int) -> int:
     """Take a node for `observation` below `branch`, or NONE if the tree is full."""
     child = new_node(tree, observation)
     if child != NONE:
@@ -271,7 +271,7 @@ def _simulate_once(tree: Tree, model: Any, settings: SearchSettings, rng: NDArra
             break
         node = find_child(tree, branch, observation)
         if node == NONE:
-            node = _add_child(tree, branch, observation)
+            node = new_child(tree, branch, observation)
             tree.counters[REFUSED] += node == NONE
     value = 0.0
     if not terminal:

@@ -238,7 +238,7 @@ def _legal_rollout(
     value, weight, left = 0.0, 1.0, depth_left
     while left > 0:
         bits = random_bits(rng)  # the upper half picks the action, the lower half the answer
-        action = int(((bits >> _HALF) * np.uint64(CHECK + rocks)) >> _HALF)
+        action = np.int64(((bits >> _HALF) * np.uint64(CHECK + rocks)) >> _HALF)
         if action >= CHECK:
             rock = action - CHECK
             if (spent >> rock) & 1:
