@@ -1,4 +1,4 @@
-"""Random worlds for the benches of the local planner: 41 x 41 nodes at 1 m, walls, risky edges, seen and unseen ground."""
+"""Random worlds for the benches of the local planner: 41 x 41 nodes at 1 m, walls, risky edges, ground half seen."""
 
 from __future__ import annotations
 
