@@ -11,7 +11,7 @@ from scipy.ndimage import label
 
 from planning.coverage_model import CoverageModel, RootBelief, build_model
 from planning.grid import DIRECTION_DX, DIRECTION_DY
-from planning.reward import RewardWeights, parameters
+from planning.reward import parameters
 from services.lcp.config import Config
 
 SIZE = 41
@@ -113,7 +113,7 @@ def model_at(
             np.ones(1),
             np.zeros(world.size, np.uint64),
         ),
-        weights=parameters(config.weights if config else RewardWeights()),
+        weights=parameters(config.weights),
         horizon=config.horizon,
         rollout_random=config.rollout_random,
     )
