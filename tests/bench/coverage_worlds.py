@@ -98,20 +98,25 @@ def model_at(
 ) -> CoverageModel:
     """The local planner's problem at a node, as lcp would set it up there. entropy: (n,), by default the world's."""
     config = config or Config()
+    entropy = world.entropy if entropy is None else entropy
+    columns = np.uint64(1) << np.arange(world.size, dtype=np.uint64)
+    covered = np.where(entropy.reshape(world.size, world.size) > 0.0, np.uint64(0), columns[None, :]).sum(
+        axis=1
+    )
     return build_model(
         size=world.size,
         reach=world.reach,
         fov_rad=math.radians(fov_deg),
         edge_distance_m=world.distance_m,
         edge_risk=world.risk,
-        entropy=world.entropy if entropy is None else entropy,
+        entropy=entropy,
         visible=world.visible,
         leaf_value=np.zeros(world.size**2),
         root=RootBelief(
             np.array([node], np.int32),
             np.array([heading], np.uint8),
             np.ones(1),
-            np.zeros(world.size, np.uint64),
+            covered.astype(np.uint64),
         ),
         weights=parameters(config.weights),
         horizon=config.horizon,
