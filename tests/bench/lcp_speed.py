@@ -13,11 +13,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.coverage_model import ACTIONS, BITS, search_coverage
+from planning.coverage_model import ACTIONS, BITS, look, search_coverage
 from planning.pomcp import Pomcp
 from plgrim.evaluation.bare_walk import bare_walk, search_bare_walk
 from services.lcp.config import Config
-from tests.bench.coverage_worlds import SIZE, model_at, random_world
+from tests.bench.coverage_worlds import SIZE, World, model_at, random_world
 
 
 def solver(config: Config, workers: int = 1) -> Pomcp:
@@ -33,6 +33,15 @@ def solver(config: Config, workers: int = 1) -> Pomcp:
     )
 
 
+def after_a_look(world: World, fov_deg: float) -> NDArray[np.float64]:
+    """The entropies when the robot has looked from its start, as it always has. (n,)"""
+    words = np.zeros(world.size, np.uint64)
+    look(model_at(world, world.start, 0, fov_deg=fov_deg), world.start, 0, words)
+    columns = np.arange(world.size, dtype=np.uint64)
+    seen = ((words[:, None] >> columns[None, :]) & np.uint64(1)).ravel() > 0
+    return np.where(seen, 0.0, world.entropy)
+
+
 def measure(
     rounds: int, simulations: int, fov_deg: float, reach: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -42,7 +51,7 @@ def measure(
     cpu, wall = np.zeros((rounds, 3)), np.zeros((rounds, 3))
     for k in range(-1, rounds):
         world = random_world(1000 + k, reach=reach, risky_share=0.1, seen=True)
-        model = model_at(world, world.start, 0, fov_deg=fov_deg, config=config)
+        model = model_at(world, world.start, 0, entropy=after_a_look(world, fov_deg), fov_deg=fov_deg)
         bare = bare_walk(model)
         searches: tuple[Callable[[], object], ...] = (
             lambda model=model, k=k: alone.search(search_coverage, model, seed=k, simulations=simulations),  # type: ignore[misc]
