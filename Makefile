@@ -5,6 +5,7 @@
 #   make demo        a whole mission in a built-in world, every service a process of its own
 #   make test        the default test suite            make test-slow   the long tests too
 #   make worlds      missions through the nine regression worlds, one for each complaint
+#   make bench       the short form of every bench: figures printed, minutes; BENCHES="qmdp lcp-speed" for some
 #   make faults      kill -9 of every service, five times each, in missions that go on; minutes, figures printed
 #   make lint        ruff, mypy, import-linter         make format      let ruff rewrite the files
 #   make check       env, lint and test in a clean copy of the tree: what CI runs
@@ -33,7 +34,7 @@ export UV_LINK_MODE ?= copy
 # Third-party maps and recordings, which the tests that need them skip visibly without.
 export PLGRIM_DATA_DIR ?= $(abspath ../shared/data)
 
-.PHONY: help venv env demo test test-slow worlds faults lint format check lock clean
+.PHONY: help venv env demo test test-slow worlds bench faults lint format check lock clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -69,6 +70,11 @@ test-slow: env
 
 worlds: env
 	@$(BIN)/python -m pytest -s -q tests/worlds $(PYTEST_ARGS)
+
+# Peers are compared where they are installed: pip install pomdp-py quantecon.
+BENCHES ?=
+bench: env
+	@$(BIN)/python -m tests.bench $(BENCHES)
 
 # FAULTS_ARGS="--times 1 --services irm sim --speed 1" for less.
 FAULTS_ARGS ?=

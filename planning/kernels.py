@@ -57,4 +57,7 @@ def njit_borrowing(function: _Function) -> _Function:
     hand a model of two dozen arrays to small functions that was most of the time. A function that would have to count
     (one that allocates or slices) is refused at compilation.
     """
-    return cast(_Function, numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function))
+    return cast(
+        _Function,
+        numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False, forceinline=True)(function),
+    )

@@ -40,6 +40,7 @@ Randomness comes only from `rng`, a uint64[4] array (`random_uniform(rng)` in [0
 
     solver = Pomcp(state_size=1, max_actions=3, max_nodes=1 << 16, max_branches=1 << 18, max_depth=40)
     report = solver.search(search_tiger, model, seed=7, simulations=4096, should_stop=lambda: clock() > deadline)
+    # workers=2: two trees, grown by two threads from a stream each, then added up
     solver.root()                         # RootStatistics: actions, visits, values, max and mean value
     solver.best_action()                  # largest mean among the actions with enough visits
     solver.policy(min_visits=16)          # PolicyTree: flat arrays, down to histories with that many visits
@@ -48,8 +49,10 @@ Randomness comes only from `rng`, a uint64[4] array (`random_uniform(rng)` in [0
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, NamedTuple
 
+from planning.pomcp_merge import merge_tree
 from planning.pomcp_model import no_prior, register_model
 from planning.pomcp_policy import (
     MIN_VISIT_SHARE,
@@ -116,12 +119,18 @@ class SearchReport(NamedTuple):
     mean_depth: float
 
 
+_WORKER = 0xD1342543DE82EF95
+EntryPoint = Callable[[Tree, Any, SearchSettings, Any, int], None]
+
+
 class Pomcp:
     """A tree, its settings and its random stream, allocated once and used for one search after another.
 
     `max_nodes` bounds the histories (one a simulation at most; 32 bytes each), `max_branches` the actions at
     expanded ones (20 bytes each; default four a node). When either is used up the search goes on without growing.
-    `exploration`, `return_range` and `logarithmic` as in `SearchSettings`.
+    `exploration`, `return_range` and `logarithmic` as in `SearchSettings`. `workers`: trees (each of these sizes) that
+    as many threads grow, each from its own stream, and that are added up afterwards: `tree` is then their sum. The
+    threads share nothing and hold no GIL, so that what they find depends on the seed and their number alone.
     `ValueError` on a size or a number out of range.
     """
 
@@ -136,7 +145,10 @@ class Pomcp:
         exploration: float = 0.25,
         return_range: float = 0.0,
         logarithmic: bool = False,
+        workers: int = 1,
     ) -> None:
+        if workers < 1:
+            raise ValueError(f"workers {workers} must be at least 1")
         if not (0.0 <= exploration < float("inf") and 0.0 <= return_range < float("inf")):
             raise ValueError(
                 f"exploration {exploration} and return_range {return_range} must be finite and >= 0"
@@ -144,18 +156,25 @@ class Pomcp:
         self.settings = SearchSettings(
             int(max_depth), float(exploration), float(return_range), bool(logarithmic)
         )
-        self.tree = new_tree(
-            state_size=state_size,
-            max_actions=max_actions,
-            max_nodes=max_nodes,
-            max_branches=4 * max_nodes if max_branches is None else max_branches,
-            max_depth=max_depth,
-        )
-        self._stream = random_stream(0)
+        branches = 4 * max_nodes if max_branches is None else max_branches
+
+        def tree(times: int) -> Tree:
+            return new_tree(
+                state_size=state_size,
+                max_actions=max_actions,
+                max_nodes=times * max_nodes,
+                max_branches=times * branches,
+                max_depth=max_depth,
+            )
+
+        self._trees = [tree(1) for _ in range(workers)]
+        self.tree = self._trees[0] if workers == 1 else tree(workers)
+        self._streams = [random_stream(i) for i in range(workers)]
+        self._threads = ThreadPoolExecutor(workers - 1, "pomcp") if workers > 1 else None
 
     def search(
         self,
-        entry_point: Callable[[Tree, Any, SearchSettings, Any, int], None],
+        entry_point: EntryPoint,
         model: Any,
         *,
         seed: int,
@@ -174,16 +193,35 @@ class Pomcp:
         if simulations < 1 or batch < 1:
             raise ValueError(f"simulations {simulations} and batch {batch} must be at least 1")
         if not resume:
-            clear_tree(self.tree)
-            self._stream = random_stream(seed)
+            for tree in self._trees:
+                clear_tree(tree)
+            self._streams = [random_stream(seed ^ (i * _WORKER)) for i in range(len(self._trees))]
         size = simulations if should_stop is None else batch
         done, stopped = 0, False
         while done < simulations and not stopped:
             count = min(size, simulations - done)
-            entry_point(self.tree, model, self.settings, self._stream, count)
+            self._run(entry_point, model, done, done + count)
             done += count
             stopped = should_stop is not None and should_stop()
+        if len(self._trees) > 1:
+            clear_tree(self.tree)
+            for tree in self._trees:
+                merge_tree(self.tree, tree)
         return self._report(done, "simulations" if done >= simulations else "caller")
+
+    def _run(self, entry_point: EntryPoint, model: Any, first: int, last: int) -> None:
+        """Simulations `first` to `last` of a search, shared out evenly whatever the batches are."""
+        n = len(self._trees)
+
+        def work(i: int) -> None:
+            count = (last * (i + 1) // n - last * i // n) - (first * (i + 1) // n - first * i // n)
+            entry_point(self._trees[i], model, self.settings, self._streams[i], count)
+
+        # The first worker is this thread; it also compiles and loads the kernel if that is still to be done.
+        others = [self._threads.submit(work, i) for i in range(1, n)] if self._threads is not None else []
+        work(0)
+        for other in others:
+            other.result()
 
     def root(self, min_visit_share: float = MIN_VISIT_SHARE) -> RootStatistics:
         """Statistics of the root, see `RootStatistics`."""

@@ -15,13 +15,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 from planning.pomcp_model import model_actions, model_prior, model_rollout, model_sample, model_step
 
 # What depends on the model is compiled into the model's own entry point and cached there, next to the model's file.
 # Cached here, one index would name every model ever used (tests included) and each process would have to import
 # them all; and a change in a model's file would leave a stale kernel behind.
-_njit_inside_entry_point: Callable[[Any], Any] = numba.njit(nogil=True, error_model="numpy")
+# Both kinds borrow their arguments (see `planning.kernels.njit_borrowing`): counting references of the two dozen arrays
+# of a tree at every call was more than half of the time of a search.
+_njit_inside_entry_point: Callable[[Any], Any] = numba.njit(nogil=True, error_model="numpy", _nrt=False)
 
 NONE = -1
 """Where an index is stored: there is no such node or branch."""
@@ -128,7 +130,7 @@ def clear_tree(tree: Tree) -> None:
     new_node(tree, 0)
 
 
-@njit
+@njit_borrowing
 def new_node(tree: Tree, observation: int) -> int:
     """Take the next free node, or NONE if the tree is full."""
     node = tree.counters[NODES]
@@ -144,7 +146,7 @@ def new_node(tree: Tree, observation: int) -> int:
     return node
 
 
-@njit
+@njit_borrowing
 def find_child(tree: Tree, branch: int, observation: int) -> int:
     """The node below `branch` for `observation`, or NONE."""
     child = tree.branch_first_child[branch]
@@ -153,8 +155,8 @@ def find_child(tree: Tree, branch: int, observation: int) -> int:
     return child
 
 
-@njit
-def _add_child(tree: Tree, branch: int, observation: int) -> int:
+@njit_borrowing
+def new_child(tree: Tree, branch: int, observation: int) -> int:
     """Take a node for `observation` below `branch`, or NONE if the tree is full."""
     child = new_node(tree, observation)
     if child != NONE:
@@ -163,7 +165,7 @@ def _add_child(tree: Tree, branch: int, observation: int) -> int:
     return child
 
 
-@njit
+@njit_borrowing
 def _add_branches(tree: Tree, node: int, count: int) -> None:
     """Give `node` the `count` actions and priors that lie in the scratch arrays; room was checked."""
     first = tree.counters[BRANCHES]
@@ -177,7 +179,7 @@ def _add_branches(tree: Tree, node: int, count: int) -> None:
     tree.node_branches[node] = count
 
 
-@njit
+@njit_borrowing
 def select_branch(tree: Tree, node: int, exploration: float, logarithmic: bool) -> int:
     """UCB at an expanded node: the first untried branch, else the largest sum of mean and bonus."""
     first = tree.node_first_branch[node]
@@ -197,7 +199,7 @@ def select_branch(tree: Tree, node: int, exploration: float, logarithmic: bool) 
     return best
 
 
-@njit
+@njit_borrowing
 def _exploration_at(tree: Tree, depth: int, settings: SearchSettings) -> float:
     """The constant of the bonus in units of reward at `depth`."""
     if settings.return_range > 0.0:
@@ -206,7 +208,7 @@ def _exploration_at(tree: Tree, depth: int, settings: SearchSettings) -> float:
     return settings.exploration * spread if spread > 0.0 else 0.0
 
 
-@njit
+@njit_borrowing
 def _record_return(tree: Tree, node: int, depth: int, value: float) -> None:
     """Count a return from `node` and widen the range of returns at its depth."""
     tree.node_visits[node] += 1
@@ -215,7 +217,7 @@ def _record_return(tree: Tree, node: int, depth: int, value: float) -> None:
     tree.return_high[depth] = max(tree.return_high[depth], value)
 
 
-@njit
+@njit_borrowing
 def _back_up(tree: Tree, leaf: int, depth: int, value: float) -> None:
     """Return `value`, seen at `leaf` (NONE: outside the tree) after `depth` steps, to the histories on the path."""
     if leaf != NONE:
@@ -236,8 +238,9 @@ def _expand(tree: Tree, node: int, model: Any) -> int:
         return 0
     if tree.counters[BRANCHES] + count > tree.branch_visits.size:
         return NONE
-    tree.prior_visits[:count] = 0
-    tree.prior_values[:count] = 0.0
+    for i in range(count):
+        tree.prior_visits[i] = 0
+        tree.prior_values[i] = 0.0
     model_prior(model, tree.state, tree.actions, count, tree.prior_visits, tree.prior_values)
     _add_branches(tree, node, count)
     return count
@@ -268,7 +271,7 @@ def _simulate_once(tree: Tree, model: Any, settings: SearchSettings, rng: NDArra
             break
         node = find_child(tree, branch, observation)
         if node == NONE:
-            node = _add_child(tree, branch, observation)
+            node = new_child(tree, branch, observation)
             tree.counters[REFUSED] += node == NONE
     value = 0.0
     if not terminal:

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from planning.kernels import njit
 from planning.search import heap_pop, heap_push_or_lower
+from services.gcp.labels import best_labels, reaching
 
 STAY = -1
 """Action of a frontier, of a node where staying is best and of a node that reaches no frontier."""
@@ -45,7 +46,8 @@ class GlobalGraph(NamedTuple):
     indptr (N + 1,), indices (E,): edges of node i are indptr[i] to indptr[i + 1].
     discount, cost: (E,), see `edge_terms`.
     terminal: (N,), the frontiers. gain: (N,), expected information gain, read at frontiers only.
-    reverse_indptr, reverse_source, reverse_edge: the same edges by their end node.
+    reverse_indptr, reverse_source, reverse_edge, reverse_discount, reverse_cost: the same edges by their end node
+    (copies: who replaces `cost` replaces `reverse_cost` too).
     """
 
     indptr: NDArray[np.int32]
@@ -57,6 +59,8 @@ class GlobalGraph(NamedTuple):
     reverse_indptr: NDArray[np.int32]
     reverse_source: NDArray[np.int32]
     reverse_edge: NDArray[np.int32]
+    reverse_discount: NDArray[np.float64]
+    reverse_cost: NDArray[np.float64]
 
 
 class QmdpSolution(NamedTuple):
@@ -134,7 +138,11 @@ def global_graph(
     gain = np.zeros(nodes)
     gain[frontiers] = gains
     start, end = indptr.astype(np.int32), indices.astype(np.int32)
-    return GlobalGraph(start, end, terms.discount, terms.cost, terminal, gain, *_transpose(start, end))
+    reverse_indptr, source, edge = _transpose(start, end)
+    return GlobalGraph(
+        start, end, terms.discount, terms.cost, terminal, gain, reverse_indptr, source, edge,
+        terms.discount[edge], terms.cost[edge],
+    )  # fmt: skip
 
 
 @njit
@@ -217,29 +225,6 @@ def label_setting_to(
 
 
 @njit
-def _reaches_frontier(graph: GlobalGraph) -> NDArray[np.bool_]:
-    """Nodes from which passable edges lead to a frontier."""
-    nodes = graph.terminal.shape[0]
-    reached = graph.terminal.copy()
-    stack = np.empty(nodes, np.int32)
-    top = 0
-    for node in range(nodes):
-        if reached[node]:
-            stack[top] = node
-            top += 1
-    while top > 0:
-        top -= 1
-        node = stack[top]
-        for slot in range(graph.reverse_indptr[node], graph.reverse_indptr[node + 1]):
-            other = graph.reverse_source[slot]
-            if not reached[other] and graph.cost[graph.reverse_edge[slot]] < np.inf:
-                reached[other] = True
-                stack[top] = other
-                top += 1
-    return reached
-
-
-@njit
 def _improve(
     graph: GlobalGraph,
     usable: NDArray[np.bool_],
@@ -314,16 +299,29 @@ def _evaluate(
 
 @njit
 def _solve(
-    graph: GlobalGraph, targets: NDArray[np.int32], allow_stay: bool
+    graph: GlobalGraph, allow_stay: bool
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.bool_], float, int]:
     nodes = graph.terminal.shape[0]
     action = np.empty(nodes, np.int32)
-    value = label_setting(graph, targets, 0.0 if allow_stay else -np.inf, -1, action)
-    reached = _reaches_frontier(graph)
-    usable = np.ones(nodes, np.bool_) if allow_stay else reached
+    value, left = best_labels(
+        graph.reverse_indptr, graph.reverse_source, graph.reverse_edge, graph.reverse_discount,
+        graph.reverse_cost, graph.terminal, graph.gain, 0.0 if allow_stay else -np.inf, action,
+    )  # fmt: skip
+    reached = reaching(
+        graph.indptr,
+        graph.indices,
+        graph.cost,
+        graph.reverse_indptr,
+        graph.reverse_source,
+        graph.reverse_cost,
+        value,
+    )
     for node in range(nodes):
         if value[node] == -np.inf:
             value[node] = 0.0
+    if left <= _IMPROVEMENT:  # no edge is worth more than the action taken: the Bellman equation holds
+        return value, action, reached, left, 0
+    usable = np.ones(nodes, np.bool_) if allow_stay else reached
     iterations = 0
     while True:
         changed, residual = _improve(graph, usable, allow_stay, value, action)
@@ -347,8 +345,7 @@ def solve(graph: GlobalGraph, allow_stay: bool = True, tolerance: float = 1e-9) 
     Raises:
         ArithmeticError: if the residual stays above the tolerance (not seen; it guards the proof above).
     """
-    targets = np.flatnonzero(graph.terminal).astype(np.int32)
-    value, action, reached, residual, iterations = _solve(graph, targets, allow_stay)
+    value, action, reached, residual, iterations = _solve(graph, allow_stay)
     if not residual <= tolerance * (1.0 + float(np.abs(value).max(initial=0.0))):
         raise ArithmeticError(
             f"QMDP did not converge: Bellman residual {residual} after {iterations} iterations"

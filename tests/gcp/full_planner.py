@@ -101,7 +101,10 @@ class GlobalPlanner:
         gone = graph.terminal & near
         source = np.repeat(np.arange(gone.size), np.diff(road_map.indptr))
         cost = np.where(gone[source] | gone[road_map.indices], np.inf, graph.cost)
-        return self._values(graph._replace(terminal=graph.terminal & ~gone, cost=cost))
+        reverse_cost = cost[graph.reverse_edge]
+        return self._values(
+            graph._replace(terminal=graph.terminal & ~gone, cost=cost, reverse_cost=reverse_cost)
+        )
 
     def _values(self, graph: GlobalGraph) -> Values:
         solution = solve(graph, allow_stay=False)

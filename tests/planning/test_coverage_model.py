@@ -34,11 +34,12 @@ from planning.coverage_model import (
     new_nodes,
     reachable_entropy,
     rollout_value,
+    search_coverage,
     turn_share,
 )
 from planning.pomcp import random_bits, random_stream
 from planning.reward import RewardWeights
-from tests.planning.coverage_lattices import Edge, Reference, random_lattice, reachable
+from tests.planning.coverage_lattices import Edge, Reference, coverage_solver, random_lattice, reachable
 
 SEEDS = st.integers(0, 2**32 - 1)
 WEIGHTS = RewardWeights(
@@ -455,3 +456,23 @@ def test_rollouts_with_chance_stay_on_edges() -> None:
         ends.add(int(state[NODE]))
     assert ends <= within
     assert len(ends) > 5
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_an_all_round_sensor_skips_changes_nothing(seed: int) -> None:
+    """Having looked all round, turning shows nothing and moves are bounded by what they can newly show: the rule's
+    choice, the rewards and so the whole search are the same as without these short cuts."""
+    lattice = random_lattice(seed, 7, 2, 360.0, wall_share=0.15, risky_share=0.3, covered_share=0.2)
+    start = sorted({node for node, _ in lattice.edges})[seed % 5]
+    model = lattice.model(start, seed % 8, lattice.footprint(start, 0), rollout_random=0.1)
+    assert model.all_round
+    plain = model._replace(all_round=False)
+    trees = []
+    for each in (model, plain):
+        solver = coverage_solver(7, max_depth=12)
+        solver.search(search_coverage, each, seed=seed, simulations=400)
+        trees.append(solver.root())
+    assert trees[0].visits.tolist() == trees[1].visits.tolist()
+    assert trees[0].values.tolist() == trees[1].values.tolist()
+    unseen = lattice.model(start, 0, (), rollout_random=0.1)
+    assert not unseen.all_round or not lattice.footprint(start, 0)
