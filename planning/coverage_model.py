@@ -41,6 +41,7 @@ _BLOCKED = 8
 _MAX_CLUSTERS = 400
 _DX, _DY = DIRECTION_DX, DIRECTION_DY
 _ONE = np.uint64(1)
+_FULL_TURN = 2.0 * math.pi - 1e-6
 _TURN = np.array([[min((a - b) % 8, (b - a) % 8) / 4.0 for b in range(8)] for a in range(8)])
 
 
@@ -54,7 +55,8 @@ class CoverageModel(NamedTuple):
     the rows of the footprint that are not empty, half open. cluster_*: groups of uncovered nodes for the informed
     rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_rows (c, 3) words, cluster_top (c,) first row.
     horizon: moves of every simulation, in the tree and the rollout together, so that values of short and of long
-    actions compare. all_round: the sensor sees all round and the root has looked, so that turning shows nothing new.
+    actions compare. looks_on_turn: not for a sensor that sees all round: it has looked from where the robot stands, and
+    what a node still promises there would be seen from its anchor. all_round: such a sensor, and the root has looked;
     fresh_most: (n, 8), then the most that a move can newly cover, having looked from its start.
     """
 
@@ -81,6 +83,7 @@ class CoverageModel(NamedTuple):
     cluster_top: NDArray[np.int32]
     horizon: int
     rollout_random: float
+    looks_on_turn: bool
     all_round: bool
     fresh_most: NDArray[np.int64]
 
@@ -187,7 +190,7 @@ def _move(
     turn = turn_share(heading, k)
     distance, risk = float(model.edge_distance_m[node, k]), float(model.edge_risk[node, k])
     state[HEADING] = k
-    information = look(model, node, k, covered) if k != heading and not model.all_round else 0.0
+    information = look(model, node, k, covered) if k != heading and model.looks_on_turn else 0.0
     if edge_blocked(model, state[KEY], node, k):
         return information, action_cost(model.weights, 0.0, risk, turn), 0.5 * distance, True
     state[NODE] = model.step_to[node, k]
@@ -741,7 +744,7 @@ def build_model(
     )
     footprint = np.zeros((size * size, 8, 2 * reach + 1), np.uint64)
     _footprints(seen, wedge_rows(reach, fov_rad), size, reach, footprint)
-    all_round = fov_rad >= 2.0 * math.pi - 1e-9 and bool(
+    all_round = fov_rad >= _FULL_TURN and bool(
         _has_looked(footprint, top_row, root.node, np.array(root.covered))
     )
     fresh = _fresh_most(footprint, top_row, step_to) if all_round else np.zeros((0, 8), np.int64)
@@ -749,5 +752,6 @@ def build_model(
         size, reach, weights, step_to, top_row, distance, risk, weights.gamma_per_m ** distance.astype(np.float64),
         np.array(entropy), low, high, footprint, np.array(leaf_value),
         np.array(root.node), np.array(root.heading),
-        np.array(root.weight), np.array(root.covered), move, cost, rows, top, horizon, rollout_random, all_round, fresh,
+        np.array(root.weight), np.array(root.covered), move, cost, rows, top, horizon, rollout_random,
+        fov_rad < _FULL_TURN, all_round, fresh,
     )  # fmt: skip
