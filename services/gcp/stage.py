@@ -20,6 +20,7 @@ from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION, ODOMETRY
 from schemas.world import GraphRequest
 from services.gcp.config import Config
+from services.gcp.hfe import frontier_options, scope_of
 from services.gcp.planner import Belief, Floats, GlobalPlanner, Option, Slots
 from services.gcp.roadnet import Graph, RoadNet
 
@@ -127,7 +128,7 @@ class GcpStage:
         if mission is not None and mission.phase == MissionPhase.RETURN:
             return self._choose_home(belief, mission)
         held = self._held_frontiers()
-        options = self._planner.options(belief, held, self.config.alternatives)
+        options = self._options(belief, held)
         if not options:
             count = len(self._roads.frontiers)
             reason = (
@@ -135,6 +136,16 @@ class GcpStage:
             )
             return _Choice(None, f"no target: {reason}")
         return self._keep_or_switch(options, held)
+
+    def _options(self, belief: Belief, held: list[int]) -> list[Option]:
+        """The best frontiers, best first, and the one held."""
+        c, top = self.config, self.config.alternatives
+        if c.solver == "qmdp":
+            return self._planner.options(belief, held, top)
+        h = c.hfe
+        return frontier_options(
+            self._roads, belief.node, h.scopes_m, h.gain_weight, h.risk_weight_m, top, held
+        )
 
     def _choose_home(self, belief: Belief, mission: MissionState) -> _Choice:
         home = (mission.home.x_m, mission.home.y_m, mission.home.z_m)
@@ -177,6 +188,9 @@ class GcpStage:
     def _margin(self, kept: Option, best: Option) -> float:
         """How much better the best must be. For a crumb, whole ground is not left unseen, nor what lies before it."""
         c = self.config
+        if c.solver == "hfe":
+            scopes = [scope_of(option.distance_m, c.hfe.scopes_m) for option in (kept, best)]
+            return c.hfe.switch_margin if scopes[0] == scopes[1] else -math.inf
         crumb = kept.gain < max(c.crumb_share * self._target.gain, c.crumb_gain)
         times = c.crumb_times if c.crumb_times > 0.0 else math.inf
         much_more = best.gain >= times * kept.gain and best.distance_m <= 2.0 * kept.distance_m
@@ -201,7 +215,9 @@ class GcpStage:
             path_node = np.append(path_node, path_node[-1:])
             path_xyz = np.vstack((path_xyz, np.array(choice.extra_xyz_m)))
         place = path_xyz[-1] if option is not None else robot
-        near = roads.near(robot, radius_m)
+        near = roads.near(
+            robot, radius_m if self.config.solver == "qmdp" else 0.0
+        )  # else nobody asks for values
         policy = self._planner.policy(near, robot, self.config.local_range_m)
         worth = np.flatnonzero((policy.value > 0.0) | (policy.value_to_go > 0.0))
         told, piece = _pieces_around(path_xyz, robot, radius_m)

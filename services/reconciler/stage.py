@@ -208,9 +208,9 @@ class ReconcilerStage:
             model, start, heading, moves, c.replan_rollouts, self._value_ratio, self._stream_seed()
         )
         most = max(first, sum(1 for m in ahead if m <= c.max_kept_m) - 1)
-        if c.profile == "paper":
+        if c.profile in ("paper", "always_old"):
             most = len(ahead) - 1
-        kept = choose_tau(terms, first, most, c.regulariser, c.profile == "paper")
+        kept = choose_tau(terms, first, most, c.regulariser, c.profile)
         if kept < first:
             return None
         cover_along(model, committed, irm, reachable[: kept + 1], covered)
