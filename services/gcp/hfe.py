@@ -88,7 +88,7 @@ def frontier_options(
     top: int,
     keep: Sequence[int],
 ) -> list[Option]:
-    """The best frontiers and those in `keep`, smaller scopes first and in each the larger reward (then the lower id)."""
+    """The best frontiers and those in `keep`, smaller scopes first, in each the larger reward, then the lower id."""
     frontiers = roads.frontier_slots()
     if frontiers.size == 0:
         return []

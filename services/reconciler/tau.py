@@ -12,7 +12,6 @@ from planning.lattice_graph import neighbour
 from planning.pomcp import random_stream
 from planning.reward import travel_discount
 
-
 Profile = Literal["default", "paper", "always_new", "always_old"]
 
 
@@ -77,8 +76,8 @@ def choose_tau(
 ) -> int:
     """The number of steps to keep: argmax over at_least..at_most (clipped to what is possible; ties keep less).
 
-    paper: the literal rule, kept reward alone. default: kept + replanned - lambda R. always_new and always_old: the ends
-    of the range, whatever they are worth, to show what the choice is good for.
+    paper: the literal rule, kept reward alone. default: kept + replanned - lambda R. always_new and always_old: the
+    ends of the range, whatever they are worth, to show what the choice is good for.
     """
     high = max(0, min(at_most, terms.possible))
     low = min(at_least, high)
