@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from plgrim.commands import evaluate_missions, evaluate_tour
+from plgrim.commands import evaluate_missions, evaluate_paper, evaluate_tour
 
 
 def register(app: typer.Typer) -> None:
@@ -13,5 +13,6 @@ def register(app: typer.Typer) -> None:
         name="evaluate", help="Experiments: campaigns of missions, and peers.", no_args_is_help=True
     )
     evaluate_missions.register(group)
+    evaluate_paper.register(group)
     evaluate_tour.register(group)
     app.add_typer(group)

@@ -345,3 +345,4 @@ def warm_up() -> None:
         planner.options(Belief(np.zeros((1, 3)), middle), [], 1)
         planner.policy(roads.near(np.zeros(3), 2.0), np.zeros(3), 0.5)
         planner.way_home(middle, roads.slot_of(1))
+        frontier_options(roads, middle, (), 1.0, 1.0, 1, ())

@@ -32,6 +32,7 @@ from services.lcp.problem import (
     planar,
 )
 from services.lcp.promises import Index, Promises
+from services.lcp.viewpoints import warm_up_viewpoints
 
 __all__ = ["Config", "LcpStage", "create", "spec", "warm_up"]
 
@@ -369,3 +370,4 @@ def warm_up() -> None:
     edges, value = np.zeros((9, 8), np.float32), np.zeros(9)
     edges.setflags(write=False)
     spread_values(np.zeros(9), 3, edges, edges, 0.9, 0.0, 0.0, value)
+    warm_up_viewpoints()

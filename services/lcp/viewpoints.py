@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.coverage_model import MAX_EDGE_RISK, CoverageModel, evaluate_moves
+from planning.coverage_model import MAX_EDGE_RISK, CoverageModel, RootBelief, build_model, evaluate_moves
 from planning.kernels import njit
 from planning.lattice_graph import neighbour, travel_costs
-from planning.reward import travel_discount
+from planning.reward import RewardWeights, parameters, travel_discount
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -124,3 +124,17 @@ def best_view(
     moves = np.empty(longest, np.int64)
     count = path_to(ways.start, ways.back, model.size, int(viewpoints[best]), moves)
     return View(int(viewpoints[best]), [int(k) for k in moves[:count]], float(reward[best]))
+
+
+def warm_up_viewpoints() -> None:
+    """Compile the kernels: two nodes beside each other in a lattice of nine."""
+    edges, entropy = np.zeros((9, 8), np.float32), np.ones(9)
+    edges[3, 0] = edges[4, 4] = 1.0
+    visible = np.full((9, 3), 7, np.uint32)
+    root = RootBelief(np.array([3], np.int32), np.zeros(1, np.uint8), np.ones(1), np.zeros(3, np.uint64))
+    model = build_model(
+        size=3, reach=1, fov_rad=2.0, edge_distance_m=edges, edge_risk=0.1 * edges, entropy=entropy, visible=visible,
+        leaf_value=np.zeros(9), root=root, weights=parameters(RewardWeights()), horizon=2, rollout_random=0.0,
+    )  # fmt: skip
+    ways = ways_from(model, 3, 1.0)
+    best_view(model, ways, 0, viewpoints_within(model, ways, 5.0), 4)
