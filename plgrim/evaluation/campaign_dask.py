@@ -131,7 +131,8 @@ class DaskPool:
 
     def _slots(self) -> int:
         """One mission a thread of the workers, and one that waits there."""
-        return sum(self._client.nthreads().values()) + 1
+        threads: dict[str, int] = self._client.nthreads()
+        return sum(threads.values()) + 1
 
     def _submit(self, folder: Path, stop_name: str) -> Any:
         return self._client.submit(

@@ -37,11 +37,11 @@ METRICS = (
 )
 
 _LEGEND = """\
-Means over the seeds; in brackets the difference from `default` in pairs of the same seed with its 95 % bootstrap interval.
-Heading jump: between the direction of a new plan just behind the point where it leaves the plan that is driven, and
-the direction before (the robot's own where they part at once). Turned: all turning of the robot over its way. Hazard: a
-block that comes down on the line being driven; cut: the line no longer runs into it; new way: a line that leads on
-elsewhere.
+Means over the seeds; in brackets the difference from `default` in pairs of the same seed with its 95 % bootstrap
+interval. Heading jump: between the direction of a new plan just behind the point where it leaves the plan that is
+driven, and the direction before (the robot's own where they part at once). Turned: all turning of the robot over its
+way. Hazard: a block that comes down on the line being driven; cut: the line no longer runs into it; new way: a line
+that leads on elsewhere.
 """
 
 

@@ -42,6 +42,8 @@ GRID: Mapping[str, Mapping[str, Overlay]] = {
         "min_reward_0.1": _nbv(min_reward=0.1),
         "min_reward_1": _nbv(min_reward=1.0),
         "forgets_best": _nbv(keep_best=False),
+        "switches_for_half": _nbv(switch_share=0.5),
+        "goes_to_the_view": _nbv(switch_share=1e9),
         "shortest_paths": _nbv(risk_weight_m=0.0),
         "myopic": {"lcp": {"weights": {"gamma_per_m": 0.95}}},
         "far_sighted": {"lcp": {"weights": {"gamma_per_m": 0.995}}},

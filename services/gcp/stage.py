@@ -215,9 +215,8 @@ class GcpStage:
             path_node = np.append(path_node, path_node[-1:])
             path_xyz = np.vstack((path_xyz, np.array(choice.extra_xyz_m)))
         place = path_xyz[-1] if option is not None else robot
-        near = roads.near(
-            robot, radius_m if self.config.solver == "qmdp" else 0.0
-        )  # else nobody asks for values
+        asked = self.config.solver == "qmdp"  # else the local planner asks for no values
+        near = roads.near(robot, radius_m) if asked else np.empty(0, np.int32)
         policy = self._planner.policy(near, robot, self.config.local_range_m)
         worth = np.flatnonzero((policy.value > 0.0) | (policy.value_to_go > 0.0))
         told, piece = _pieces_around(path_xyz, robot, radius_m)

@@ -17,7 +17,7 @@ from schemas.policy import GlobalPolicy
 from schemas.world import LocalIrm
 from services.lcp.config import HfeConfig, NbvConfig
 from services.lcp.problem import Junction, planar
-from services.lcp.viewpoints import Ints, View, best_view, viewpoints_within, ways_from
+from services.lcp.viewpoints import Ints, View, Ways, best_view, viewpoints_within, ways_from
 
 _LONGEST = 80
 """Moves of a path, at most."""
@@ -40,8 +40,8 @@ class NextBestView:
         ways = ways_from(model, junction.node, c.risk_weight_m)
         for attempt, radius_m in enumerate((c.radius_m, math.inf)):
             within = viewpoints_within(model, ways, radius_m if math.isfinite(radius_m) else 1e9)
-            sampled = self._sample(within, episode, attempt)
-            view = best_view(model, ways, junction.heading, self._with_last(irm, within, sampled), _LONGEST)
+            view = best_view(model, ways, junction.heading, self._sample(within, episode, attempt), _LONGEST)
+            view = self._or_last(irm, model, ways, junction, within, view)
             if view is not None and view.reward >= c.min_reward:
                 node, heading = divmod(view.viewpoint, 8)
                 self._best = (irm.ix0 + node % irm.size, irm.iy0 + node // irm.size, heading)
@@ -56,15 +56,27 @@ class NextBestView:
         rng = stream(self._seed, "lcp", "nbv", episode, attempt)
         return np.sort(rng.choice(within, self._config.samples, replace=False))
 
-    def _with_last(self, irm: LocalIrm, within: Ints, sampled: Ints) -> Ints:
-        """The samples, and the last best viewpoint where it is still one."""
+    def _or_last(
+        self,
+        irm: LocalIrm,
+        model: CoverageModel,
+        ways: Ways,
+        junction: Junction,
+        within: Ints,
+        view: View | None,
+    ) -> View | None:
+        """The last best viewpoint again, unless it is worth nothing any more or the new one is clearly better."""
         if self._best is None or not self._config.keep_best:
-            return sampled
+            return view
         column, row = self._best[0] - irm.ix0, self._best[1] - irm.iy0
-        if not (0 <= column < irm.size and 0 <= row < irm.size):
-            return sampled
         last = (row * irm.size + column) * 8 + self._best[2]
-        return np.union1d(sampled, [last]) if np.isin(last, within) else sampled
+        if not (0 <= column < irm.size and 0 <= row < irm.size and np.isin(last, within)):
+            return view
+        again = best_view(model, ways, junction.heading, np.array([last]), _LONGEST)
+        if again is None or again.reward < self._config.min_reward:
+            return view
+        is_better = view is not None and view.reward > again.reward * (1.0 + self._config.switch_share)
+        return view if is_better else again
 
     def state(self) -> list[int]:
         """For a snapshot."""

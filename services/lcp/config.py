@@ -30,7 +30,13 @@ class NbvConfig(BaseModel):
         le=100,
         description="A view that is worth less is not gone to; then it is led to the target.",
     )
-    keep_best: bool = Field(True, description="The last best viewpoint is always among the candidates.")
+    keep_best: bool = Field(True, description="The last best viewpoint is always among the candidates,")
+    switch_share: float = Field(
+        0.0,
+        ge=0,
+        le=1e9,
+        description="and left for one that is worth more than it by this share. 1e9: gone to.",
+    )
 
 
 class HfeConfig(BaseModel):
