@@ -27,7 +27,7 @@ SAME_M = 0.05
 """Two lines go together while they are no farther apart."""
 BASE_M = 0.5
 """Directions are those of chords of this length."""
-AHEAD_M = 12.0
+AHEAD_M = 40.0
 """No farther ahead is compared."""
 SHARP_RAD = math.radians(45.0)
 WATCHED_S = 20.0
