@@ -33,8 +33,7 @@ FIRST_TUNING_SEED = 101
 
 NBV: Overlay = {
     "lcp": {"planner": "nbv"},
-    "gcp": {"solver": "hfe", "hfe": {"scopes_m": [], "gain_weight": 0.0, "switch_margin": 2.0}},
-    "reconciler": {"profile": "always_new"},
+    "gcp": {"solver": "hfe", "hfe": {"scopes_m": [], "gain_weight": 0.0}},
 }
 """Next best view on the Local IRM. Where nothing in the window is worth its way, it goes to the nearest frontier of the
 Global IRM: the paper lets baselines search both roadmaps; without that it would stand still for good."""

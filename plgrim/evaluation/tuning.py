@@ -49,7 +49,7 @@ GRID: Mapping[str, Mapping[str, Overlay]] = {
         "far_sighted": {"lcp": {"weights": {"gamma_per_m": 0.995}}},
         "no_leftovers": {"lcp": {"weights": _NO_LEFTOVERS}, "reconciler": {"weights": _NO_LEFTOVERS}},
         "best_frontier": _hfe(gain_weight=1.0),
-        "tau_default": {"reconciler": {"profile": "default"}},
+        "tau_new": {"reconciler": {"profile": "always_new"}},
         "tau_old": {"reconciler": {"profile": "always_old"}},
     },
     "hfe": {
