@@ -21,6 +21,7 @@ from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION
 from schemas.world import GraphRequest
 from services.gcp.config import Config
 from services.gcp.hfe import frontier_options, scope_of
+from services.gcp.orienteering import Outlook, Visits
 from services.gcp.planner import Belief, Floats, GlobalPlanner, Option, Slots
 from services.gcp.roadnet import Graph, RoadNet
 
@@ -67,6 +68,11 @@ class GcpStage:
         self._seed = setup.seed
         self._roads = RoadNet(config.reward)
         self._planner = GlobalPlanner(self._roads)
+        self._visits = (
+            Visits(self._roads, config.reward.gamma_per_m, config.group_m, config.groups)
+            if config.solver == "orienteering"
+            else None
+        )
         self._target = _Target()
         self._tick = 0
         self._asked_ns = -1
@@ -128,19 +134,23 @@ class GcpStage:
         if mission is not None and mission.phase == MissionPhase.RETURN:
             return self._choose_home(belief, mission)
         held = self._held_frontiers()
-        options = self._options(belief, held)
+        tour = self._visits.first(belief.node, held[0] if held else -1) if self._visits else None
+        wanted = [*held, tour.first] if tour is not None and tour.first >= 0 else held
+        options = self._options(belief, wanted)
         if not options:
             count = len(self._roads.frontiers)
             reason = (
                 f"none of {count} frontiers can be reached over the graph" if count else "no frontier is left"
             )
             return _Choice(None, f"no target: {reason}")
+        if tour is not None:
+            return self._keep_or_switch_tour(options, held, tour)
         return self._keep_or_switch(options, held)
 
     def _options(self, belief: Belief, held: list[int]) -> list[Option]:
-        """The best frontiers, best first, and the one held."""
+        """The best frontiers, best first, and those held."""
         c, top = self.config, self.config.alternatives
-        if c.solver == "qmdp":
+        if c.solver != "hfe":
             return self._planner.options(belief, held, top)
         h = c.hfe
         return frontier_options(
@@ -185,6 +195,22 @@ class GcpStage:
         gap_m = float(np.linalg.norm(self._roads.xyz_m[best.node] - np.array(self._target.xyz_m)))
         return _Choice(best, f"{says}; {why}", gap_m > self.config.same_target_m, shown)
 
+    def _keep_or_switch_tour(self, options: list[Option], held: list[int], tour: Outlook) -> _Choice:
+        """Keep the target unless a tour that begins elsewhere is better by both margins."""
+        shown = tuple(options[: self.config.alternatives])
+        best = next((option for option in options if option.node == tour.first), options[0])
+        kept = next((option for option in options if option.node in held), None)
+        says = f"{_describe(self._roads, best)}; begins a tour worth {tour.value:.1f}"
+        if kept is None:
+            return _Choice(best, says, alternatives=shown)
+        c = self.config
+        margin = max(c.tour_margin, c.tour_margin_relative * abs(tour.kept_value))
+        if best.node == kept.node or tour.value <= tour.kept_value + margin:
+            return _Choice(kept, f"{_describe(self._roads, kept)}; kept", alternatives=shown)
+        why = f"switched, against {tour.kept_value:.1f} by {_describe(self._roads, kept)} first"
+        gap_m = float(np.linalg.norm(self._roads.xyz_m[best.node] - np.array(self._target.xyz_m)))
+        return _Choice(best, f"{says}; {why}", gap_m > c.same_target_m, shown)
+
     def _margin(self, kept: Option, best: Option) -> float:
         """How much better the best must be. For a crumb, whole ground is not left unseen, nor what lies before it."""
         c = self.config
@@ -215,7 +241,7 @@ class GcpStage:
             path_node = np.append(path_node, path_node[-1:])
             path_xyz = np.vstack((path_xyz, np.array(choice.extra_xyz_m)))
         place = path_xyz[-1] if option is not None else robot
-        asked = self.config.solver == "qmdp"  # else the local planner asks for no values
+        asked = self.config.solver != "hfe"  # its local planner asks for no values
         near = roads.near(robot, radius_m) if asked else np.empty(0, np.int32)
         policy = self._planner.policy(near, robot, self.config.local_range_m)
         worth = np.flatnonzero((policy.value > 0.0) | (policy.value_to_go > 0.0))
