@@ -29,7 +29,8 @@ def _hfe(**changes: object) -> Overlay:
     return {"gcp": {"hfe": changes}}
 
 
-_NO_LEFTOVERS = {"leftover_weight": 0.0, "leftover_gain": 0.0}
+_LEFTOVERS = {"leftover_weight": 3.0, "leftover_gain": 0.3}
+"""As PLGRIM counts them."""
 
 GRID: Mapping[str, Mapping[str, Overlay]] = {
     "nbv": {
@@ -47,7 +48,7 @@ GRID: Mapping[str, Mapping[str, Overlay]] = {
         "shortest_paths": _nbv(risk_weight_m=0.0),
         "myopic": {"lcp": {"weights": {"gamma_per_m": 0.95}}},
         "far_sighted": {"lcp": {"weights": {"gamma_per_m": 0.995}}},
-        "no_leftovers": {"lcp": {"weights": _NO_LEFTOVERS}, "reconciler": {"weights": _NO_LEFTOVERS}},
+        "leftovers": {"lcp": {"weights": _LEFTOVERS}, "reconciler": {"weights": _LEFTOVERS}},
         "best_frontier": _hfe(gain_weight=1.0),
         "tau_new": {"reconciler": {"profile": "always_new"}},
         "tau_old": {"reconciler": {"profile": "always_old"}},

