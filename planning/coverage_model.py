@@ -41,6 +41,7 @@ _BLOCKED = 8
 _MAX_CLUSTERS = 400
 _DX, _DY = DIRECTION_DX, DIRECTION_DY
 _ONE = np.uint64(1)
+_FULL_TURN = 2.0 * math.pi - 1e-6
 _TURN = np.array([[min((a - b) % 8, (b - a) % 8) / 4.0 for b in range(8)] for a in range(8)])
 
 
@@ -53,6 +54,8 @@ class CoverageModel(NamedTuple):
     particle_*: (p,), the root belief. covered: (size,) bits that count as covered already. row_low, row_high: (n,),
     the rows of the footprint that are not empty, half open. cluster_*: groups of uncovered nodes for the informed
     rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_rows (c, 3) words, cluster_top (c,) first row.
+    looks_on_turn: whether turning shows something new: not to a sensor that looks all around. It has looked from where
+    the robot stands; what the model still promises there would be seen from the node's anchor.
     horizon: moves of every simulation, in the tree and the rollout together, so that values of short and of long
     actions compare.
     """
@@ -80,6 +83,7 @@ class CoverageModel(NamedTuple):
     cluster_top: NDArray[np.int32]
     horizon: int
     rollout_random: float
+    looks_on_turn: bool
 
 
 def wedge_rows(reach: int, fov_rad: float) -> NDArray[np.uint32]:
@@ -184,7 +188,7 @@ def _move(
     turn = turn_share(heading, k)
     distance, risk = float(model.edge_distance_m[node, k]), float(model.edge_risk[node, k])
     state[HEADING] = k
-    information = look(model, node, k, covered) if k != heading else 0.0
+    information = look(model, node, k, covered) if k != heading and model.looks_on_turn else 0.0
     if edge_blocked(model, state[KEY], node, k):
         return information, action_cost(model.weights, 0.0, risk, turn), 0.5 * distance, True
     state[NODE] = model.step_to[node, k]
@@ -703,4 +707,5 @@ def build_model(
         np.array(entropy), low, high, footprint, np.array(leaf_value),
         np.array(root.node), np.array(root.heading),
         np.array(root.weight), np.array(root.covered), move, cost, rows, top, horizon, rollout_random,
+        fov_rad < _FULL_TURN,
     )  # fmt: skip
