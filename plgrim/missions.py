@@ -10,8 +10,9 @@ from typing import Any
 
 from rich.console import Console
 
+from planning.robot_profile import PROFILES
 from plgrim.config import Config, service_config_class
-from plgrim.evaluation.recorder import RECORDED, MissionRecorder
+from plgrim.evaluation.recorder import RECORDED, MissionRecorder, quantile
 from plgrim.logs import get_logger
 from plgrim.progress import MissionProgress
 from plgrim.registry import STAGES
@@ -158,6 +159,8 @@ def run_lockstep(
     recorder = MissionRecorder(config.seed, world_name(config), "lockstep")
     options = {name: config.options(name) for name in STAGES}
     lockstep = Lockstep(options, config.seed, config.robot, recorder.observe)
+    recorder.changes.footprint_radius_m = PROFILES[config.profile].footprint_radius_m
+    recorder.changes.closed = getattr(lockstep.stage("sim"), "closed_areas_m", tuple)
     began = time.monotonic()
     lost_ns = 0
     with MissionProgress(recorder, "", console) as progress:
@@ -180,5 +183,12 @@ def run_lockstep(
         "times_real_time": lockstep.now / SECOND_NS / max(wall_s, 1e-9),
         "digest": lockstep.digest(),
         "dropped": lockstep.dropped(),
+        "answers": {name: _milliseconds(s) for name, s in lockstep.answer_seconds().items() if s},
     }
     return recorder.write(out_dir, lockstep.step_seconds(), extra)
+
+
+def _milliseconds(seconds: list[float]) -> Result:
+    """How many steps, and quantiles of their wall time."""
+    p50, p99 = quantile(seconds, 0.5), quantile(seconds, 0.99)
+    return {"count": len(seconds), "p50_ms": 1e3 * (p50 or 0.0), "p99_ms": 1e3 * (p99 or 0.0)}

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import typer
 
-from plgrim.commands import evaluate_grid, evaluate_missions, evaluate_solvers, evaluate_tour
+from plgrim.commands import (
+    evaluate_grid,
+    evaluate_missions,
+    evaluate_paper,
+    evaluate_solvers,
+    evaluate_tour,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -13,6 +19,7 @@ def register(app: typer.Typer) -> None:
         name="evaluate", help="Experiments: campaigns of missions, and peers.", no_args_is_help=True
     )
     evaluate_missions.register(group)
+    evaluate_paper.register(group)
     evaluate_tour.register(group)
     evaluate_grid.register(group)
     evaluate_solvers.register(group)

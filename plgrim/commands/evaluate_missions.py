@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +14,12 @@ from plgrim.commands.options import ConfigFile, OutFolder, Robot, put
 from plgrim.errors import ConfigError
 
 _INTERRUPTED = 130
+
+Jobs = Annotated[int | None, typer.Option(min=1, help="Missions at once; default: one a core.")]
+Dask = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Run on the Dask cluster with this scheduler instead.")
+]
+Force = Annotated[bool, typer.Option("--force", help="Make runs of other code or configuration anew.")]
 
 
 def missions(
@@ -40,10 +47,9 @@ def missions(
     time_limit: Annotated[
         float, typer.Option(min=0, help="Mission time after which a mission is stopped, s. 0: none.")
     ] = 0.0,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Missions at once; default: one a core.")] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Make runs of other code or configuration anew.")
-    ] = False,
+    jobs: Jobs = None,
+    dask: Dask = None,
+    force: Force = False,
     out: OutFolder = Path("out/missions"),
     config_file: ConfigFile = None,
 ) -> None:
@@ -65,22 +71,39 @@ def missions(
     put(common, "sim.start", None if start is None else {"x_m": start[0], "y_m": start[1]})
     variants = [Variant.parse(text) for text in variant or ["default"]]
     campaign = Campaign(worlds, variants, parse_seeds(seeds), time_limit, config_file, common)
-    _run(campaign, out, jobs or len(os.sched_getaffinity(0)), force)
+    drive(campaign, out, jobs, dask, force)
 
 
-def _run(campaign: Any, out: Path, jobs: int, force: bool) -> None:
+def drive(
+    campaign: Any,
+    out: Path,
+    jobs: int | None,
+    dask: str | None,
+    force: bool,
+    report: Callable[[Any], str] = lambda outcome: "summary.md, runs.csv, coverage.png, runs/",
+) -> None:
+    """Run a campaign, write its report, and end the program: 0 complete, 1 when a run crashed, 130 interrupted.
+
+    dask: a scheduler's address, to run on its cluster. report: writes what it writes of an outcome, and says its names.
+    """
     from rich.console import Console
 
     from plgrim.evaluation.campaign import run_campaign
     from plgrim.evaluation.campaign_display import CampaignDisplay
+    from plgrim.evaluation.campaign_pool import Pool, Runner
     from plgrim.logs import configure_logs
     from plgrim.runtime.process import stop_on_signals
 
     configure_logs("evaluate")
     console = Console()
+    pool: Runner = Pool(jobs or len(os.sched_getaffinity(0)))
+    if dask is not None:
+        from plgrim.evaluation.campaign_dask import DaskPool
+
+        pool = DaskPool(dask)
     with stop_on_signals() as stop, CampaignDisplay(console) as display:
-        outcome = run_campaign(campaign, out, jobs, display, stop, force)
-    console.print(f"results in {out}/: summary.md, runs.csv, coverage.png, runs/", highlight=False)
+        outcome = run_campaign(campaign, out, 0, display, stop, force, pool=pool)
+    console.print(f"results in {out}/: {report(outcome)}", highlight=False)
     for name in outcome.crashed:
         console.print(f"crashed: {name}: see {out}/runs/{name}/run.log", highlight=False, soft_wrap=True)
     if not outcome.complete:

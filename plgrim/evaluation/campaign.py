@@ -29,7 +29,7 @@ from plgrim.evaluation.campaign_child import (
     write_json,
 )
 from plgrim.evaluation.campaign_plan import Campaign, Run, code_version, differences, run_name
-from plgrim.evaluation.campaign_pool import Command, Pool, child_command
+from plgrim.evaluation.campaign_pool import Command, Pool, Runner, child_command
 from plgrim.evaluation.campaign_rows import Finished, Row, rows, write_rows
 from plgrim.evaluation.campaign_summary import summary_text
 from plgrim.registry import check_world
@@ -165,10 +165,12 @@ def run_campaign(
     stop: threading.Event | None = None,
     force: bool = False,
     command: Command = child_command,
+    pool: Runner | None = None,
 ) -> Outcome:
     """Run what is missing, `jobs` at a time; write runs.csv and summary.md after every run, coverage.png at the end.
 
-    force: runs of another configuration or other code are made anew instead of refused. Raises PlgrimError.
+    force: runs of another configuration or other code are made anew instead of refused. pool: runs them elsewhere than
+    in child processes of this one. Raises PlgrimError.
     """
     stop = stop or threading.Event()
     folder, runs = CampaignFolder(out), campaign.runs()
@@ -185,7 +187,7 @@ def run_campaign(
             folders = []
         if display is not None:
             display.planned(len(runs), len(runs) - len(todo))
-        _drive(campaign, folder, folders, Pool(jobs, command), display, stop)
+        _drive(campaign, folder, folders, pool or Pool(jobs, command), display, stop)
         table = write_outputs(campaign, folder, with_picture=True)
     status = {(row_name(row), row["fingerprint"]): row["status"] for row in table}
     own = {run.name: status.get((run.name, run.fingerprint)) for run in runs}
@@ -196,7 +198,7 @@ def _drive(
     campaign: Campaign,
     folder: CampaignFolder,
     folders: Sequence[Path],
-    pool: Pool,
+    pool: Runner,
     display: Display | None,
     stop: threading.Event,
 ) -> None:
@@ -211,7 +213,7 @@ def _drive(
 
     def poll() -> None:
         if display is not None:
-            display.poll([child.folder for child in pool.running])
+            display.poll(pool.folders)
 
     pool.run(folders, stop, ended, poll)
 

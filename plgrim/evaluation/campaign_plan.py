@@ -45,15 +45,19 @@ _MOVES_THE_ROBOT = (
 
 @dataclass(frozen=True)
 class World:
-    """A world by the name under which results are filed. sim: what the simulator is told to use."""
+    """A world by the name under which results are filed. sim: what the simulator is told to use.
+
+    limit_s: mission time here; 0: that of the campaign.
+    """
 
     name: str
     sim: Mapping[str, Any]
+    limit_s: float = 0.0
 
     @classmethod
-    def built_in(cls, name: str) -> World:
+    def built_in(cls, name: str, limit_s: float = 0.0) -> World:
         """A built-in world; its shape follows the seed."""
-        return cls(name, {"world": name})
+        return cls(name, {"world": name}, limit_s)
 
     @classmethod
     def file(cls, key: str, path: Path) -> World:
@@ -75,7 +79,7 @@ class Variant:
         if not _NAME.fullmatch(name):
             raise ConfigError(f"variant {text!r}: a name has letters, digits and ._+- only")
         if separator:
-            return cls(name, _read_overlay(Path(file)))
+            return cls(name, read_overlay(Path(file)))
         if name not in BUILT_IN_VARIANTS:
             known = ", ".join(BUILT_IN_VARIANTS)
             raise ConfigError(
@@ -84,7 +88,8 @@ class Variant:
         return cls(name, BUILT_IN_VARIANTS[name])
 
 
-def _read_overlay(path: Path) -> Overlay:
+def read_overlay(path: Path) -> Overlay:
+    """A part of a configuration from a YAML file. Raises ConfigError."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
@@ -155,7 +160,13 @@ class Campaign:
         _refuse_twice("world", [world.name for world in self.worlds])
         _refuse_twice("variant", [variant.name for variant in self.variants])
         return [
-            Run(world.name, variant.name, seed, self._config(world, variant, seed), self.limit_s)
+            Run(
+                world.name,
+                variant.name,
+                seed,
+                self._config(world, variant, seed),
+                world.limit_s or self.limit_s,
+            )
             for seed in self.seeds
             for world in self.worlds
             for variant in self.variants

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from plgrim.config import environment_overrides
 from plgrim.evaluation.campaign_child import LOG_FILE, PROGRESS_FILE
@@ -44,6 +45,25 @@ class Child:
     started_s: float = field(default_factory=time.monotonic)
 
 
+class Runner(Protocol):
+    """What runs the missions of a campaign: processes here, or a cluster."""
+
+    @property
+    def folders(self) -> list[Path]:
+        """Of the missions that run now."""
+        ...
+
+    def run(
+        self,
+        folders: Sequence[Path],
+        stop: threading.Event,
+        ended: Callable[[Path, int], None],
+        poll: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Until all have ended or `stop`. ended: told each folder and exit code as it comes. poll: now and then."""
+        ...
+
+
 class Pool:
     """Runs a child for each folder, at most `jobs` at once, in the given order.
 
@@ -55,6 +75,11 @@ class Pool:
         self._command = command
         self._is_warm = False
         self.running: list[Child] = []
+
+    @property
+    def folders(self) -> list[Path]:
+        """Of the missions that run now."""
+        return [child.folder for child in self.running]
 
     def run(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,17 @@ COLUMNS = (
     "target_switches_per_100m",
     *(f"t{level}_s" for level in LEVELS), *(f"d{level}_m" for level in LEVELS),
     *(f"{stage}_{share}_ms" for stage in STAGES for share in ("p50", "p99")),
+    *(f"{stage}_answer_{share}_ms" for stage in ("lcp", "gcp") for share in ("p50", "p99")),
+    "heading_jump_deg", "heading_jump_p95_deg", "sharp_jumps", "junctions", "turned_deg_per_m",
+    "hazards", "hazard_cut_s", "hazard_reaction_s",
     "wall_s", "times_real_time", "digest", "code", "fingerprint", "error",
 )  # fmt: skip
 """Of runs.csv. An empty cell: there is no such value (a level that was not reached, a run that crashed).
 
 coverage_mean: area under the judge's coverage over `budget_s` of mission time, divided by it; what was covered at the
 end counts until then. t90_s, d90_m: mission time and driven distance at 90 % coverage by the judge.
+lcp_answer_*: wall time of the steps that answered, not of all. heading_jump_deg ... hazard_reaction_s: see
+`plgrim.evaluation.plan_changes`. turned_deg_per_m: all turning of the true pose, over the distance driven.
 """
 
 
@@ -42,18 +47,28 @@ class Curve:
     time_s: Floats
     coverage: Floats
     distance_m: Floats
+    yaw_rad: Floats = field(default_factory=lambda: np.zeros(0))
+    """Of the true pose, (n,)."""
 
     @classmethod
     def read(cls, path: Path) -> Curve:
         """From a trajectory.csv; empty when there is none."""
-        names = ("t_s", "coverage", "distance_m")
+        names = ("t_s", "coverage", "distance_m", "true_yaw_rad")
         try:
             with path.open(newline="", encoding="utf-8") as file:
-                rows = [[float(row[name]) for name in names] for row in csv.DictReader(file)]
+                rows = [[float(row.get(name, 0.0)) for name in names] for row in csv.DictReader(file)]
         except OSError:
             rows = []
-        table = np.array(rows, np.float64).reshape(-1, 3)
-        return cls(table[:, 0], table[:, 1], table[:, 2])
+        table = np.array(rows, np.float64).reshape(-1, 4)
+        return cls(*table.T)
+
+    @property
+    def turned_deg_per_m(self) -> float | None:
+        """All turning over the distance driven, degrees a metre; None when it did not drive."""
+        if self.yaw_rad.size < 2 or self.distance_m[-1] <= 0.0:
+            return None
+        turns = np.remainder(np.diff(self.yaw_rad) + np.pi, 2.0 * np.pi) - np.pi
+        return float(np.degrees(np.abs(turns).sum()) / self.distance_m[-1])
 
     def at(self, times_s: Floats) -> Floats:
         """Coverage at times; before the first sample 0, after the last what it was then. Shape of `times_s`."""
@@ -127,6 +142,13 @@ def _row(run: Finished, budget_s: float) -> Row:
         "mission_s": result["elapsed_s"],
         "finish": result["finish"] or ("lost" if result["lost"] else "time_limit"),
     }
+    changes = result.get("plan_changes", {})
+    row |= {name: changes[name] for name in COLUMNS if name in changes}
+    row["turned_deg_per_m"] = run.curve.turned_deg_per_m
+    for stage, cost in result.get("answers", {}).items():
+        for share in ("p50", "p99"):
+            if f"{stage}_answer_{share}_ms" in row:
+                row[f"{stage}_answer_{share}_ms"] = cost[f"{share}_ms"]
     for level in LEVELS:
         if (found := run.curve.reached(level / 100.0)) is not None:
             row[f"t{level}_s"], row[f"d{level}_m"] = found

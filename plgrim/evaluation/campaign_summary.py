@@ -73,14 +73,14 @@ def _world_text(world: str, rows: Sequence[Row], wanted: Sequence[str]) -> str:
         for name in variants
     }
     lines = [f"## {world}\n", *_notes(rows)]
-    lines += _markdown(
+    lines += markdown(
         ["variant", "runs", "lost", *(metric.title for metric in METRICS), "times real time"],
         [_variant_cells(name, finished[name]) for name in variants],
     )
     first, *others = variants
     if others:
         lines += ["", f"Differences from `{first}`:", ""]
-        lines += _markdown(
+        lines += markdown(
             ["variant", "pairs", _LOST.title, *(metric.title for metric in METRICS)],
             [_difference_cells(world, name, finished[name], finished[first]) for name in others],
         )
@@ -155,6 +155,7 @@ def _difference_text(metric: Metric, differences: Sequence[float], world: str, n
     return f"{text} [{found.low:+.{metric.digits}f}, {found.high:+.{metric.digits}f}]"
 
 
-def _markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """The lines of a Markdown table."""
     lines = [header, ["-"] * len(header), *rows]
     return ["| " + " | ".join(cells) + " |" for cells in lines]

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from planning.frames import Planar
+from plgrim.evaluation.plan_changes import PlanChanges
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS, Stamp, Topic
 from schemas.operation import FinishReason, JudgeReport, MissionState, StageHealth, WorldPicture
@@ -60,12 +61,16 @@ class MissionRecorder:
     """Collects what the result needs. Thread safe.
 
     seed, world: for the result only. speed: mission seconds a wall second, to give latencies in wall time too.
+    changes: what is to be learnt of how plans change.
     """
 
-    def __init__(self, seed: int, world: str, mode: str, speed: float = 1.0) -> None:
+    def __init__(
+        self, seed: int, world: str, mode: str, speed: float = 1.0, changes: PlanChanges | None = None
+    ) -> None:
         self._lock = threading.Lock()
         self._about = {"seed": seed, "world": world, "mode": mode, "speed": speed}
         self._speed = speed
+        self.changes = changes or PlanChanges()
         self.mission: MissionState | None = None
         self.judge: JudgeReport | None = None
         self.coverage: CoverageSummary | None = None
@@ -104,12 +109,14 @@ class MissionRecorder:
                 self.mission = message
             case Odometry():
                 self.odometry = message
+                self.changes.see_pose(message)
             case GlobalPolicy():
                 self.policy = message
                 self.switches += message.switched
             case Plan():
                 self.plan = message
                 self._add_latency(message, now)
+                self.changes.see_plan(message, now)
             case WorldPicture():
                 self.picture = message
             case StageHealth():
@@ -199,6 +206,7 @@ class MissionRecorder:
                 "contacts": judge.contacts if judge else None,
                 "left": [place.model_dump() for place in mission.left] if mission else [],
                 "cloud_to_plan": self._latency(),
+                "plan_changes": self.changes.result(),
                 "stages": self._stages(step_seconds or {}),
                 "restarts": dict(self.restarts),
                 "versions": _versions(),

@@ -34,6 +34,7 @@ class _Runner:
     due_ns: int
     triggers: frozenset[str]
     step_s: list[float] = field(default_factory=list)
+    answer_s: list[float] = field(default_factory=list)
 
 
 class Lockstep:
@@ -108,9 +109,11 @@ class Lockstep:
     def _step(self, runner: _Runner) -> None:
         began = time.perf_counter()
         inputs = runner.mailbox.inputs(self.now)
+        answers = False
         for output in runner.stage.step(self.now, inputs):
             payload = runner.outbox.pack(output, self.now, inputs.consumed)
             self._order += 1
+            answers = True
             heapq.heappush(
                 self._pending, (self.now + runner.spec.latency_ns, self._order, output.topic, payload)
             )
@@ -119,6 +122,8 @@ class Lockstep:
         runner.mailbox.stepped()
         runner.due_ns = self.now + runner.spec.period_ns
         runner.step_s.append(time.perf_counter() - began)
+        if answers:
+            runner.answer_s.append(runner.step_s[-1])
 
     def stage(self, name: str) -> Stage:
         """The stage object of a service, for tests and library use."""
@@ -127,6 +132,10 @@ class Lockstep:
     def step_seconds(self) -> dict[str, list[float]]:
         """Wall seconds of every step so far by service; measurement only, no stage sees them."""
         return {name: runner.step_s for name, runner in self._runners.items()}
+
+    def answer_seconds(self) -> dict[str, list[float]]:
+        """Wall seconds of the steps that said something, by service: what a planner's answer costs."""
+        return {name: runner.answer_s for name, runner in self._runners.items()}
 
     def dropped(self) -> dict[str, int]:
         """Refused messages by `service/topic:reason`."""

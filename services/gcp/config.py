@@ -2,11 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from planning.reward import RewardWeights
+
+
+class HfeConfig(BaseModel):
+    """Hierarchical frontier-based exploration, the paper's global baseline."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    scopes_m: tuple[Annotated[float, Field(gt=0, le=1e6)], ...] = Field(
+        (12.0,), description="Frontiers within so much travel come before all others, smallest first, m."
+    )
+    gain_weight: float = Field(
+        1.0, ge=0, le=1000, description="Weight of a frontier's gain against the way there. 0: the nearest."
+    )
+    risk_weight_m: float = Field(
+        5.0, ge=0, le=1000, description="Metres of way that a risk of 1 counts in its paths."
+    )
+    switch_margin: float = Field(
+        1.0,
+        ge=0,
+        le=1e9,
+        description="The target is left for one of the same scope that pays so much more, nats. "
+        "1e9: once chosen, it is gone to; smaller scopes come first all the same.",
+    )
 
 
 class Config(BaseModel):
@@ -17,10 +40,12 @@ class Config(BaseModel):
     period_s: float = Field(1.0, gt=0, le=60, description="Time between steps without a new graph, s.")
     latency_s: float = Field(0.05, ge=0, le=10, description="Lock-step: time that a step takes, s.")
     reward: RewardWeights = RewardWeights()
-    solver: Literal["qmdp", "orienteering"] = Field(
+    solver: Literal["qmdp", "orienteering", "hfe"] = Field(
         "qmdp",
-        description="The paper's QMDP, or the best order in which to visit all frontiers (after FIG-OP).",
+        description="The paper's QMDP; the best order in which to visit all frontiers (after FIG-OP); or hfe, the "
+        "paper's frontier-based baseline.",
     )
+    hfe: HfeConfig = HfeConfig()
     group_m: float = Field(
         4.0, ge=0, le=50, description="Frontiers so near to one another are one stop (orienteering), m."
     )

@@ -20,6 +20,7 @@ from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION, ODOMETRY
 from schemas.world import GraphRequest
 from services.gcp.config import Config
+from services.gcp.hfe import frontier_options, scope_of
 from services.gcp.orienteering import Outlook, Visits
 from services.gcp.planner import Belief, Floats, GlobalPlanner, Option, Slots
 from services.gcp.roadnet import Graph, RoadNet
@@ -135,7 +136,7 @@ class GcpStage:
         held = self._held_frontiers()
         tour = self._visits.first(belief.node, held[0] if held else -1) if self._visits else None
         wanted = [*held, tour.first] if tour is not None and tour.first >= 0 else held
-        options = self._planner.options(belief, wanted, self.config.alternatives)
+        options = self._options(belief, wanted)
         if not options:
             count = len(self._roads.frontiers)
             reason = (
@@ -145,6 +146,16 @@ class GcpStage:
         if tour is not None:
             return self._keep_or_switch_tour(options, held, tour)
         return self._keep_or_switch(options, held)
+
+    def _options(self, belief: Belief, held: list[int]) -> list[Option]:
+        """The best frontiers, best first, and those held."""
+        c, top = self.config, self.config.alternatives
+        if c.solver != "hfe":
+            return self._planner.options(belief, held, top)
+        h = c.hfe
+        return frontier_options(
+            self._roads, belief.node, h.scopes_m, h.gain_weight, h.risk_weight_m, top, held
+        )
 
     def _choose_home(self, belief: Belief, mission: MissionState) -> _Choice:
         home = (mission.home.x_m, mission.home.y_m, mission.home.z_m)
@@ -203,6 +214,9 @@ class GcpStage:
     def _margin(self, kept: Option, best: Option) -> float:
         """How much better the best must be. For a crumb, whole ground is not left unseen, nor what lies before it."""
         c = self.config
+        if c.solver == "hfe":
+            scopes = [scope_of(option.distance_m, c.hfe.scopes_m) for option in (kept, best)]
+            return c.hfe.switch_margin if scopes[0] == scopes[1] else -math.inf
         crumb = kept.gain < max(c.crumb_share * self._target.gain, c.crumb_gain)
         times = c.crumb_times if c.crumb_times > 0.0 else math.inf
         much_more = best.gain >= times * kept.gain and best.distance_m <= 2.0 * kept.distance_m
@@ -227,7 +241,8 @@ class GcpStage:
             path_node = np.append(path_node, path_node[-1:])
             path_xyz = np.vstack((path_xyz, np.array(choice.extra_xyz_m)))
         place = path_xyz[-1] if option is not None else robot
-        near = roads.near(robot, radius_m)
+        asked = self.config.solver != "hfe"  # its local planner asks for no values
+        near = roads.near(robot, radius_m) if asked else np.empty(0, np.int32)
         policy = self._planner.policy(near, robot, self.config.local_range_m)
         worth = np.flatnonzero((policy.value > 0.0) | (policy.value_to_go > 0.0))
         told, piece = _pieces_around(path_xyz, robot, radius_m)
@@ -355,3 +370,4 @@ def warm_up() -> None:
         planner.options(Belief(np.zeros((1, 3)), middle), [], 1)
         planner.policy(roads.near(np.zeros(3), 2.0), np.zeros(3), 0.5)
         planner.way_home(middle, roads.slot_of(1))
+        frontier_options(roads, middle, (), 1.0, 1.0, 1, ())

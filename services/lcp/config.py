@@ -2,9 +2,54 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from planning.reward import RewardWeights
+
+
+class NbvConfig(BaseModel):
+    """Next-best-view planning, the paper's local baseline."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    samples: int = Field(256, ge=1, le=20_000, description="Viewpoints that an answer samples.")
+    radius_m: float = Field(
+        12.0,
+        ge=1,
+        le=1000,
+        description="Travel to the viewpoints sampled first, at most, m; then the window's.",
+    )
+    risk_weight_m: float = Field(
+        5.0, ge=0, le=1000, description="Metres of way that a risk of 1 counts in its paths; 0: the shortest."
+    )
+    min_reward: float = Field(
+        0.3,
+        ge=0,
+        le=100,
+        description="A view that is worth less is not gone to; then it is led to the target.",
+    )
+    keep_best: bool = Field(True, description="The last best viewpoint is always among the candidates,")
+    switch_share: float = Field(
+        0.0,
+        ge=0,
+        le=1e9,
+        description="and left for one that is worth more than it by this share. 1e9: gone to.",
+    )
+
+
+class HfeConfig(BaseModel):
+    """The way to the frontier, of the paper's frontier-based baseline. Which frontier is gcp's."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    look_radius_m: float = Field(
+        3.0,
+        ge=0,
+        le=60,
+        description="At its end it looks at what is uncovered within this of the frontier, m.",
+    )
 
 
 class Config(BaseModel):
@@ -12,6 +57,11 @@ class Config(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    planner: Literal["pomcp", "nbv", "hfe"] = Field(
+        "pomcp", description="pomcp: the paper's planner; nbv, hfe: its baselines."
+    )
+    nbv: NbvConfig = NbvConfig()
+    hfe: HfeConfig = HfeConfig()
     weights: RewardWeights = RewardWeights()
     max_depth: int = Field(24, ge=1, le=200, description="Horizon of the tree, actions.")
     max_nodes: int = Field(40_000, ge=100, le=5_000_000, description="Histories that the tree can hold.")

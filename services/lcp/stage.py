@@ -18,6 +18,7 @@ from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPhase, LocalPolicy
 from schemas.snapshot import pack_message, pack_snapshot, unpack_message, unpack_snapshot
 from schemas.topics import EPISODE, GLOBAL_POLICY, LOCAL_IRM, LOCAL_POLICY, MISSION
 from schemas.world import LocalIrm
+from services.lcp.baselines import FrontierLook, NextBestView
 from services.lcp.config import Config
 from services.lcp.guide import way_along
 from services.lcp.policy_path import covered_by, likely_moves, line_of, step_terms
@@ -31,6 +32,7 @@ from services.lcp.problem import (
     planar,
 )
 from services.lcp.promises import Index, Promises
+from services.lcp.viewpoints import warm_up_viewpoints
 
 __all__ = ["Config", "LcpStage", "create", "spec", "warm_up"]
 
@@ -63,6 +65,8 @@ class LcpStage:
         self._covering = True
         self._answered = 0
         self._promises = Promises(config.promises, config.promise_rest_s)
+        self._next_view = NextBestView(config.nbv, setup.seed)
+        self._frontier_look = FrontierLook(config.hfe)
         self._solver = Pomcp(
             state_size=BITS + 61,
             max_actions=ACTIONS,
@@ -102,9 +106,45 @@ class LcpStage:
         for index in self._promises.left_alone(now, uncovered):
             if index in uncovered:
                 entropy[_node(irm, index)] = 0.0
+        if self._config.planner != "pomcp" and not returning:
+            return self._baseline(now, request, irm, junction, entropy, uncovered, policy)
         if not returning and self._should_cover(irm, junction, entropy, policy):
             return self._cover(now, request, irm, junction, entropy, uncovered, policy)
         return self._guide(now, request, irm, junction, policy)
+
+    def _baseline(
+        self,
+        now: Stamp,
+        request: EpisodeRequest,
+        irm: LocalIrm,
+        junction: Junction,
+        entropy: np.ndarray,
+        uncovered: dict[Index, float],
+        policy: GlobalPolicy | None,
+    ) -> LocalPolicy:
+        """The path to the next best view, or the way to gcp's frontier and a look there."""
+        look, by_frontier = self._frontier_look, self._config.planner == "hfe"
+        if by_frontier and not look.arrived(policy):
+            guided = self._guide(now, request, irm, junction, policy)
+            if guided.phase == LocalPhase.GUIDE or policy is None or policy.target < 0:
+                return guided
+            look.note_arrival(policy)
+        counted = leftover_entropy(entropy, irm.state == 1, irm.size, self._config.weights)
+        if by_frontier and policy is not None:
+            counted = look.near_target(irm, policy, counted)
+        model = coverage_model(irm, counted, np.zeros(irm.size**2), junction, self._config)
+        if by_frontier:
+            view = look.choose(model, junction, parameters(self._config.weights).k_risk)
+        else:
+            view = self._next_view.choose(irm, model, junction, request.episode)
+        if view is None:
+            return self._guide(now, request, irm, junction, policy)
+        soon = covered_by(model, junction.node, junction.heading, view.moves[: self._config.promise_moves])
+        self._promises.note(now, (index for index in uncovered if soon[_node(irm, index)]), uncovered)
+        terms = step_terms(model, junction.node, junction.heading, view.moves)
+        reason = f"goes to a view worth {view.reward:.2f}"
+        return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, view.moves, 0,
+                       _EMPTY_TREE, view.reward, 0, 0, 0.0, terms)  # fmt: skip
 
     def _should_cover(
         self, irm: LocalIrm, junction: Junction, entropy: np.ndarray, policy: GlobalPolicy | None
@@ -210,6 +250,8 @@ class LcpStage:
                 "answered": self._answered,
                 "irms": [pack_message(irm) for irm in self._irms.values()],
                 "promises": self._promises.state(),
+                "next_view": self._next_view.state(),
+                "frontier_look": self._frontier_look.state(),
             }
         )
 
@@ -220,6 +262,8 @@ class LcpStage:
         irms = [unpack_message(packed, LocalIrm) for packed in state["irms"]]
         self._irms = OrderedDict((irm.irm_version, irm) for irm in irms)
         self._promises.set_state(state["promises"])
+        self._next_view.set_state(state["next_view"])
+        self._frontier_look.set_state(state["frontier_look"])
 
 
 def indexed(irm: LocalIrm, entropy: np.ndarray) -> dict[Index, float]:
@@ -328,3 +372,4 @@ def warm_up() -> None:
     edges, value = np.zeros((9, 8), np.float32), np.zeros(9)
     edges.setflags(write=False)
     spread_values(np.zeros(9), 3, edges, edges, 0.9, 0.0, 0.0, value)
+    warm_up_viewpoints()

@@ -14,9 +14,11 @@ class Config(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    profile: Literal["default", "paper"] = Field(
+    profile: Literal["default", "paper", "always_new", "always_old"] = Field(
         "default",
-        description="paper: tau* by the literal rule; default: with regulariser and value of replanning.",
+        description="paper: tau* by the literal rule; default: with regulariser and value of replanning; always_new: "
+        "no more is kept than latency and braking need; always_old: all that can still be driven, and episodes open "
+        "near its end only.",
     )
     weights: RewardWeights = RewardWeights()
     # episodes

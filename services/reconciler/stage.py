@@ -165,7 +165,10 @@ class ReconcilerStage:
                 return False
             self._opened = None
         since = (now - self._opened_ns) / SECOND_NS
-        return since >= c.episode_period_s or (self._driven.left_m() < _SOON_M and since >= 0.3)
+        soon = self._driven.left_m() < _SOON_M and since >= 0.3
+        if c.profile == "always_old":  # else what is kept would grow by a whole policy with every episode
+            return soon
+        return since >= c.episode_period_s or soon
 
     def _open(self, now: Stamp, irm: LocalIrm, odometry: Odometry, ground: Ground) -> Outputs:
         self._episode += 1
@@ -208,9 +211,9 @@ class ReconcilerStage:
             model, start, heading, moves, c.replan_rollouts, self._value_ratio, self._stream_seed()
         )
         most = max(first, sum(1 for m in ahead if m <= c.max_kept_m) - 1)
-        if c.profile == "paper":
+        if c.profile in ("paper", "always_old"):
             most = len(ahead) - 1
-        kept = choose_tau(terms, first, most, c.regulariser, c.profile == "paper")
+        kept = choose_tau(terms, first, most, c.regulariser, c.profile)
         if kept < first:
             return None
         cover_along(model, committed, irm, reachable[: kept + 1], covered)

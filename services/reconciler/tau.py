@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from planning.coverage_model import CoverageModel, evaluate_moves, follow_rule, 
 from planning.lattice_graph import neighbour
 from planning.pomcp import random_stream
 from planning.reward import travel_discount
+
+Profile = Literal["default", "paper", "always_new", "always_old"]
 
 
 class TauTerms(NamedTuple):
@@ -69,12 +71,19 @@ def _mismatch(model: CoverageModel, node: int, heading: int, covered: NDArray[np
     return float(turn_share(heading, int(first[0])))
 
 
-def choose_tau(terms: TauTerms, at_least: int, at_most: int, regulariser: float, paper: bool) -> int:
+def choose_tau(
+    terms: TauTerms, at_least: int, at_most: int, regulariser: float, profile: Profile = "default"
+) -> int:
     """The number of steps to keep: argmax over at_least..at_most (clipped to what is possible; ties keep less).
 
-    paper: the literal rule, kept reward alone. Otherwise kept + replanned - lambda R.
+    paper: the literal rule, kept reward alone. default: kept + replanned - lambda R. always_new and always_old: the
+    ends of the range, whatever they are worth, to show what the choice is good for.
     """
     high = max(0, min(at_most, terms.possible))
     low = min(at_least, high)
-    score = terms.kept if paper else terms.kept + terms.replanned - regulariser * terms.mismatch
+    if profile in ("always_new", "always_old"):
+        return low if profile == "always_new" else high
+    score = terms.kept
+    if profile == "default":
+        score = terms.kept + terms.replanned - regulariser * terms.mismatch
     return low + int(np.argmax(score[low : high + 1]))

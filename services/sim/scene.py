@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -32,6 +34,7 @@ class Scene:
         closing = [
             not shut
             and now_s >= door.closes_at_s
+            and _is_near(door, robot_m)
             and (robot_m is None or not self._holds(door, robot_m, radius_m))
             for shut, door in zip(self.closed, self.world.doors, strict=True)
         ]
@@ -39,6 +42,10 @@ class Scene:
             return False
         self.set_closed([shut or now for shut, now in zip(self.closed, closing, strict=True)])
         return True
+
+    def closed_areas_m(self) -> tuple[tuple[float, float, float, float], ...]:
+        """The rectangles of the doors that have closed."""
+        return tuple(door.area_m for shut, door in zip(self.closed, self.world.doors, strict=True) if shut)
 
     def set_closed(self, closed: list[bool]) -> None:
         """Close these doors and open the others."""
@@ -68,3 +75,10 @@ class Scene:
             return 0.0
         row, column = self.world.spec.cell_of(x_m, y_m)
         return float(self.world.floor_m[row, column])
+
+
+def _is_near(door: Door, robot_m: tuple[float, float] | None) -> bool:
+    """Whether the robot is where the door closes."""
+    if robot_m is None:
+        return math.isinf(door.closes_within_m)
+    return door.gap_m(*robot_m) <= door.closes_within_m

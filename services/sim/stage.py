@@ -140,6 +140,10 @@ class SimStage:
             self._slam.move(Planar(after.x_m, after.y_m, after.yaw_rad), after.z_m, drift)
             self._blocked |= after.blocked
 
+    def closed_areas_m(self) -> tuple[tuple[float, float, float, float], ...]:
+        """Rectangles (x_low, y_low, x_high, y_high) in `map` that have become solid so far, for who judges runs."""
+        return self._scene.closed_areas_m()
+
     def _move_scene(self, now_s: float) -> None:
         """People walk and doors close."""
         state, radius_m = self._robot.state, self._config.robot.footprint_radius_m

@@ -59,11 +59,17 @@ class Mover:
 class Door:
     """A rectangle (x_low, y_low, x_high, y_high) in metres that turns solid for good at a mission time.
 
-    A door waits while the robot stands in it.
+    A door waits while the robot stands in it, and until the robot's centre has come within `closes_within_m` of it.
     """
 
     area_m: tuple[float, float, float, float]
     closes_at_s: float
+    closes_within_m: float = math.inf
+
+    def gap_m(self, x_m: float, y_m: float) -> float:
+        """Distance of a point from the rectangle; 0 inside."""
+        x_low, y_low, x_high, y_high = self.area_m
+        return math.hypot(max(x_low - x_m, x_m - x_high, 0.0), max(y_low - y_m, y_m - y_high, 0.0))
 
 
 @dataclass(frozen=True, eq=False)

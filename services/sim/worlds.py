@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from services.sim.blocks import subway_blocks
 from services.sim.cave import cave
 from services.sim.config import SimConfig
 from services.sim.elevation import load_elevation_world
@@ -59,6 +60,7 @@ _MAKERS: dict[str, Callable[[int], World]] = {
     "subway_1x": lambda seed: subway(seed, 1),
     "subway_2x": lambda seed: subway(seed, 2),
     "subway_3x": lambda seed: subway(seed, 3),
+    "subway_blocks": subway_blocks,
     "maze": maze,
     "cave": cave,
     "lava_tube": lava_tube,

@@ -100,3 +100,23 @@ def test_the_file_has_the_columns_in_order(tmp_path: Path) -> None:
     row = dict(zip(header, cells, strict=True))
     assert (row["lost"], row["lost_reason"], row["finish"]) == ("true", "fell, and tipped", "lost")
     assert (row["t99_s"], row["coverage"], row["seed"]) == ("", "0.95", "1")
+
+
+def test_a_row_tells_answers_junctions_and_turning(tmp_path: Path) -> None:
+    run = finished(tmp_path)
+    run.result.update(
+        answers={"lcp": {"count": 9, "p50_ms": 5.0, "p99_ms": 8.0}, "sim": {"count": 1, "p50_ms": 1, "p99_ms": 1}},
+        plan_changes={"junctions": 4, "heading_jump_deg": 12.5, "hazard_cut_s": None, "sharp_jumps": 0},
+    )  # fmt: skip
+    (row,) = rows([run])
+    assert tuple(row) == COLUMNS
+    assert (row["lcp_answer_p50_ms"], row["lcp_answer_p99_ms"], row["gcp_answer_p50_ms"]) == (5.0, 8.0, None)
+    assert (row["heading_jump_deg"], row["junctions"], row["hazard_cut_s"]) == (12.5, 4, None)
+
+
+def test_turning_is_summed_the_short_way_round() -> None:
+    """From 170 to -170 degrees are 20, and back to 170 another 20: 40 over 5 m."""
+    yaw = np.radians([170.0, -170.0, 170.0])
+    found = Curve(np.arange(3.0), np.zeros(3), np.array([0.0, 2.0, 5.0]), yaw)
+    assert found.turned_deg_per_m == pytest.approx(8.0)
+    assert curve((0.0, 0.0, 0.0), (1.0, 0.0, 2.0)).turned_deg_per_m is None

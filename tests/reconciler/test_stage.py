@@ -137,6 +137,23 @@ def test_the_paper_profile_keeps_more() -> None:
     assert taus["paper"] > 1.5 * taus["default"]
 
 
+def test_the_ablations_keep_nothing_but_what_latency_needs_and_everything() -> None:
+    """always_new: junctions as near as can be. always_old: no episode before the end of the path is near."""
+    taus, left_m = {}, []
+    for profile in ("default", "always_new", "always_old"):
+        rig = Rig(config=Config(simulations=256, profile=profile))
+        for _ in range(400 if profile == "always_old" else 80):
+            before, plan = len(rig.requests), rig.plans[-1] if rig.plans else None
+            rig.tick()
+            if profile == "always_old" and plan is not None and plan.valid and len(rig.requests) > before:
+                ahead = np.hypot(plan.x_m - rig.x_m, plan.y_m - rig.y_m).argmin()
+                left_m.append(float(np.hypot(np.diff(plan.x_m), np.diff(plan.y_m))[ahead:].sum()))
+        taus[profile] = np.mean([(w.junction_ns - w.stamp_ns) / SECOND_NS for w in rig.requests[1:]])
+        assert len(rig.requests) > 1
+    assert taus["always_new"] < taus["default"]
+    assert len(left_m) > 0 and max(left_m) < 2.8
+
+
 # --- safety -------------------------------------------------------------------------------------------------------
 
 

@@ -94,7 +94,7 @@ def test_tau_is_the_best_of_all_prefixes(seed: int, low: int, high: int, weight:
     node, heading = int(rng.integers(36)), int(rng.integers(8))
     moves = walk(lattice, rng, node, 7)
     terms = tau_terms(lattice.model(node, heading), node, heading, np.array(moves, np.int64), 2, 1.2, seed)
-    chosen = choose_tau(terms, low, high, weight, paper)
+    chosen = choose_tau(terms, low, high, weight, "paper" if paper else "default")
     candidates = [i for i in range(8) if low <= i <= high] or [min(low, high, 7)]
     score = {
         i: terms.kept[i] if paper else terms.kept[i] + terms.replanned[i] - weight * terms.mismatch[i]
@@ -118,7 +118,7 @@ def test_a_prefix_is_cut_before_the_first_impassable_edge(risk: float | None) ->
     assert terms.possible == 2
     assert len(terms.kept) == len(terms.replanned) == len(terms.mismatch) == 3
     for at_least in (0, 2, 4):
-        assert choose_tau(terms, at_least, 5, 0.0, True) <= 2
+        assert choose_tau(terms, at_least, 5, 0.0, "paper") <= 2
 
 
 @given(SEEDS)
@@ -143,9 +143,9 @@ def test_the_literal_rule_keeps_everything_that_pays_and_the_default_does_not() 
         mismatch=np.zeros(4),
         possible=3,
     )
-    assert choose_tau(terms, 0, 3, 0.3, True) == 3
-    assert choose_tau(terms, 0, 3, 0.3, False) == 0
-    assert choose_tau(terms, 1, 3, 0.3, False) == 1, "never less than latency and braking need"
+    assert choose_tau(terms, 0, 3, 0.3, "paper") == 3
+    assert choose_tau(terms, 0, 3, 0.3, "default") == 0
+    assert choose_tau(terms, 1, 3, 0.3, "default") == 1, "never less than latency and braking need"
 
 
 def test_the_regulariser_moves_the_junction_to_where_the_robot_need_not_turn() -> None:
@@ -155,5 +155,16 @@ def test_the_regulariser_moves_the_junction_to_where_the_robot_need_not_turn() -
         mismatch=np.array([1.0, 0.0, 0.5]),
         possible=2,
     )
-    assert choose_tau(terms, 0, 2, 0.0, False) == 0
-    assert choose_tau(terms, 0, 2, 0.3, False) == 1
+    assert choose_tau(terms, 0, 2, 0.0, "default") == 0
+    assert choose_tau(terms, 0, 2, 0.3, "default") == 1
+
+
+def test_the_ablations_keep_as_little_and_as_much_as_can_be_whatever_it_is_worth() -> None:
+    terms = TauTerms(
+        kept=np.array([0.0, 3.0, 4.0, 3.5]),
+        replanned=np.array([1.0, 9.0, 1.0, 0.0]),
+        mismatch=np.zeros(4),
+        possible=3,
+    )
+    assert [choose_tau(terms, 1, 9, 0.3, "always_new"), choose_tau(terms, 0, 9, 0.3, "always_new")] == [1, 0]
+    assert [choose_tau(terms, 1, 9, 0.3, "always_old"), choose_tau(terms, 1, 2, 0.3, "always_old")] == [3, 2]
