@@ -136,6 +136,16 @@ def look(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint
 
 
 @njit_borrowing
+def look_on_turn(
+    model: CoverageModel, node: int, heading: int, turned: int, covered: NDArray[np.uint64]
+) -> float:
+    """What the turn from a heading to another newly covers at a node; covered: (size,), changed."""
+    if turned == heading or not model.looks_on_turn:
+        return 0.0
+    return look(model, node, turned, covered)
+
+
+@njit_borrowing
 def _look(
     footprint: NDArray[np.uint64],
     row_low: NDArray[np.int32],
@@ -190,7 +200,7 @@ def _move(
     turn = turn_share(heading, k)
     distance, risk = float(model.edge_distance_m[node, k]), float(model.edge_risk[node, k])
     state[HEADING] = k
-    information = look(model, node, k, covered) if k != heading and model.looks_on_turn else 0.0
+    information = look_on_turn(model, node, heading, k, covered)
     if edge_blocked(model, state[KEY], node, k):
         return information, action_cost(model.weights, 0.0, risk, turn), 0.5 * distance, True
     state[NODE] = model.step_to[node, k]
@@ -432,7 +442,7 @@ def evaluate_moves(
         distance, risk = float(model.edge_distance_m[node, k]), float(model.edge_risk[node, k])
         if distance <= 0.0 or risk > MAX_EDGE_RISK:
             return i
-        information = look(model, node, k, covered) if k != heading else 0.0
+        information = look_on_turn(model, node, heading, k, covered)
         other = model.step_to[node, k]
         information += (1.0 - risk) * look(model, other, k, covered)
         driven = (1.0 - risk) * distance
@@ -456,7 +466,7 @@ def follow_rule(
         k, group = informed_move(model, state, covered, 0, group)
         if k < 0:
             return i
-        information = look(model, state[NODE], k, covered) if k != state[HEADING] else 0.0
+        information = look_on_turn(model, state[NODE], state[HEADING], k, covered)
         state[NODE], state[HEADING] = model.step_to[state[NODE], k], k
         information += look(model, state[NODE], k, covered)
         group = -1 if information > 0.0 else group

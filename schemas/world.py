@@ -45,7 +45,9 @@ class RiskMap(Message):
     @model_validator(mode="after")
     def _check_top(self) -> RiskMap:
         if self.top_m.shape not in ((0, 0), self.state.shape):
-            raise ValueError(f"top_m: shape {self.top_m.shape}, neither (0, 0) nor {self.state.shape} as state")
+            raise ValueError(
+                f"top_m: shape {self.top_m.shape}, neither (0, 0) nor {self.state.shape} as state"
+            )
         return self
 
 

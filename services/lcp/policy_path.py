@@ -16,6 +16,7 @@ from planning.coverage_model import (
     evaluate_moves,
     follow_rule,
     look,
+    look_on_turn,
 )
 from planning.lattice_graph import neighbour, travel_costs
 from planning.pomcp import PolicyTree
@@ -38,8 +39,7 @@ def likely_moves(
     while at >= 0 and len(moves) < steps and tree.node_action[at] >= 0:
         action = int(tree.node_action[at])
         for k in _unfold(model, action, node, heading, covered):
-            if k != heading:
-                look(model, node, k, covered)
+            look_on_turn(model, node, heading, k, covered)
             node, heading = neighbour(node, k, model.size), k
             look(model, node, k, covered)
             moves.append(k)
@@ -78,7 +78,8 @@ def step_terms(
     covered, looks = model.covered.copy(), np.zeros(len(steps) + 1, np.uint8)
     before = int(np.bitwise_count(covered).sum())
     for i, k in enumerate(moves):
-        look(model, node, k, covered)
+        if model.looks_on_turn:
+            look(model, node, k, covered)
         node = neighbour(node, k, model.size)
         look(model, node, k, covered)
         after = int(np.bitwise_count(covered).sum())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ def _search(
     node: int,
     heading: int,
     steps: int,
+    turns_show: bool,
     best: VALUES,
 ) -> None:
     """Depth first over all sequences of up to `steps` moves; a branch that cannot reach the best so far is cut."""
@@ -46,7 +48,7 @@ def _search(
         if other < 0:
             continue
         new = sees[other, k] | covered[depth]
-        if k != facing[depth]:
+        if turns_show and k != facing[depth]:
             new |= sees[at[depth], k]
         gained, left = 0.0, 0.0
         for i in range(entropy.shape[0]):
@@ -83,7 +85,7 @@ def best_value(lattice: Reference, node: int, heading: int, steps: int) -> float
     w, best = lattice.weights, np.zeros(1)
     _search(
         to, distance, sees, lattice.entropy, w.k_information, w.k_cost * w.k_distance_per_m, w.k_cost * w.k_turn,
-        w.gamma_per_m, node, heading, steps, best,
+        w.gamma_per_m, node, heading, steps, lattice.fov_rad < 2.0 * math.pi - 1e-6, best,
     )  # fmt: skip
     return float(best[0])
 

@@ -84,10 +84,13 @@ class Reference:
     def move(
         self, node: int, heading: int, covered: frozenset[int], k: int, blocked: bool
     ) -> tuple[int, frozenset[int], float, float]:
-        """One move. Returns (node, covered, reward, discount): the robot turns, looks, goes, and looks again."""
+        """One move. Returns (node, covered, reward, discount): the robot turns, looks, goes, and looks again.
+
+        A sensor that sees all round has looked before it turns.
+        """
         edge = self.edges[node, k]
         before = covered
-        if k != heading:
+        if k != heading and self.fov_rad < 2.0 * math.pi - 1e-6:
             covered |= self.footprint(node, k)
         if not blocked:
             node = self.neighbour(node, k)
