@@ -45,6 +45,12 @@ class JournalError(PlgrimError):
     exit_code = 7
 
 
+class ExplorerInputError(PlgrimError, ValueError):
+    """A grid, a cloud or a pose that the `Explorer` cannot use; the text names the field."""
+
+    exit_code = 2
+
+
 FATAL_EXIT_CODES = frozenset(
     error.exit_code for error in (ConfigError, AlreadyRunningError, PortTakenError, JournalError)
 )

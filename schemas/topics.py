@@ -130,7 +130,7 @@ EPISODE: Topic[EpisodeRequest] = _topic(
     EpisodeRequest, "reconciler/episode", "lcp", "opens a planning episode", period_ms=1000, stale_ms=5000, link=True,
 )  # fmt: skip
 LOCAL_POLICY: Topic[LocalPolicy] = _topic(
-    LocalPolicy, "lcp/local_policy", "reconciler status", "the answer to an episode", period_ms=1000,
+    LocalPolicy, "lcp/local_policy", "irm reconciler status", "the answer to an episode", period_ms=1000,
     stale_ms=5000, max_bytes=4 * _MIB, link=True,
 )  # fmt: skip
 PLAN: Topic[Plan] = _topic(

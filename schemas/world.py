@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from schemas.base import Array, Header, Message, Pose, column
 
@@ -41,6 +41,12 @@ class RiskMap(Message):
     clearance_m: Annotated[Array, column("float32", "h", "w", minimum=0)]
     elevation_m: Annotated[Array, column("float32", "h", "w")]
     top_m: Annotated[Array, column("float32", "top_h", "top_w")]
+
+    @model_validator(mode="after")
+    def _check_top(self) -> RiskMap:
+        if self.top_m.shape not in ((0, 0), self.state.shape):
+            raise ValueError(f"top_m: shape {self.top_m.shape}, neither (0, 0) nor {self.state.shape} as state")
+        return self
 
 
 class MovingPoints(Message):
@@ -94,6 +100,9 @@ class LocalIrm(Message):
 BREADCRUMB = 0
 FRONTIER = 1
 
+MAX_NODE_ID = 20_000_000
+"""Ids are given one after the other; readers keep tables by id. Hundreds of days of frontiers."""
+
 
 class GlobalIrm(Message):
     """The Global IRM in `map`, whole (base_version 0) or as the difference to base_version.
@@ -110,13 +119,13 @@ class GlobalIrm(Message):
     robot_pose: Pose
     map_to_odom: Pose
     robot_node: int = Field(ge=0)
-    node_id: Annotated[Array, column("int64", "n", minimum=0)]
+    node_id: Annotated[Array, column("int64", "n", minimum=0, maximum=MAX_NODE_ID)]
     node_kind: Annotated[Array, column("uint8", "n", maximum=1)]
     node_xyz_m: Annotated[Array, column("float64", "n", 3)]
     node_gain: Annotated[Array, column("float64", "n", minimum=0)]
     node_coverage: Annotated[Array, column("float32", "n", minimum=0, maximum=1)]
-    edge_a: Annotated[Array, column("int64", "e", minimum=0)]
-    edge_b: Annotated[Array, column("int64", "e", minimum=0)]
+    edge_a: Annotated[Array, column("int64", "e", minimum=0, maximum=MAX_NODE_ID)]
+    edge_b: Annotated[Array, column("int64", "e", minimum=0, maximum=MAX_NODE_ID)]
     edge_distance_m: Annotated[Array, column("float64", "e", minimum=0)]
     edge_risk: Annotated[Array, column("float64", "e", minimum=0, maximum=1)]
     edge_driven: Annotated[Array, column("uint8", "e", maximum=1)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from plgrim.commands import evaluate_missions, evaluate_solvers, evaluate_tour
+from plgrim.commands import evaluate_grid, evaluate_missions, evaluate_solvers, evaluate_tour
 
 
 def register(app: typer.Typer) -> None:
@@ -15,4 +15,5 @@ def register(app: typer.Typer) -> None:
     evaluate_missions.register(group)
     evaluate_tour.register(group)
     evaluate_solvers.register(group)
+    evaluate_grid.register(group)
     app.add_typer(group)

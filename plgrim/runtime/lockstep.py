@@ -88,6 +88,10 @@ class Lockstep:
                 if runner.due_ns <= self.now:
                     self._step(runner)
 
+    def wake(self, name: str, at: Stamp) -> None:
+        """Let a stage step at a time (not before now), whatever its period: for input that comes from a caller."""
+        self._runners[name].due_ns = max(at, self.now)
+
     def _release(self) -> None:
         while self._pending and self._pending[0][0] <= self.now:
             _, _, topic, payload = heapq.heappop(self._pending)

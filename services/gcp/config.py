@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from planning.reward import RewardWeights
@@ -15,6 +17,20 @@ class Config(BaseModel):
     period_s: float = Field(1.0, gt=0, le=60, description="Time between steps without a new graph, s.")
     latency_s: float = Field(0.05, ge=0, le=10, description="Lock-step: time that a step takes, s.")
     reward: RewardWeights = RewardWeights()
+    solver: Literal["qmdp", "orienteering"] = Field(
+        "qmdp",
+        description="The paper's QMDP, or the best order in which to visit all frontiers (after FIG-OP).",
+    )
+    group_m: float = Field(
+        4.0, ge=0, le=50, description="Frontiers so near to one another are one stop (orienteering), m."
+    )
+    groups: int = Field(16, ge=1, le=64, description="Stops weighed, the nearest ones (orienteering).")
+    tour_margin: float = Field(
+        2.0, ge=0, le=1000, description="The target is left for a tour that is better by this, nats, and"
+    )
+    tour_margin_relative: float = Field(
+        0.1, ge=0, le=10, description="by this share of the value of the best that goes there first."
+    )
     particles: int = Field(32, ge=1, le=4096, description="Samples of the robot's pose: the belief b(q).")
     max_pose_spread_m: float = Field(
         0.5, ge=0, le=20, description="Deviation of the pose among the nodes around it, at most, m."

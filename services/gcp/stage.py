@@ -20,6 +20,7 @@ from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION, ODOMETRY
 from schemas.world import GraphRequest
 from services.gcp.config import Config
+from services.gcp.orienteering import Outlook, Visits
 from services.gcp.planner import Belief, Floats, GlobalPlanner, Option, Slots
 from services.gcp.roadnet import Graph, RoadNet
 
@@ -66,6 +67,11 @@ class GcpStage:
         self._seed = setup.seed
         self._roads = RoadNet(config.reward)
         self._planner = GlobalPlanner(self._roads)
+        self._visits = (
+            Visits(self._roads, config.reward.gamma_per_m, config.group_m, config.groups)
+            if config.solver == "orienteering"
+            else None
+        )
         self._target = _Target()
         self._tick = 0
         self._asked_ns = -1
@@ -127,13 +133,17 @@ class GcpStage:
         if mission is not None and mission.phase == MissionPhase.RETURN:
             return self._choose_home(belief, mission)
         held = self._held_frontiers()
-        options = self._planner.options(belief, held, self.config.alternatives)
+        tour = self._visits.first(belief.node, held[0] if held else -1) if self._visits else None
+        wanted = [*held, tour.first] if tour is not None and tour.first >= 0 else held
+        options = self._planner.options(belief, wanted, self.config.alternatives)
         if not options:
             count = len(self._roads.frontiers)
             reason = (
                 f"none of {count} frontiers can be reached over the graph" if count else "no frontier is left"
             )
             return _Choice(None, f"no target: {reason}")
+        if tour is not None:
+            return self._keep_or_switch_tour(options, held, tour)
         return self._keep_or_switch(options, held)
 
     def _choose_home(self, belief: Belief, mission: MissionState) -> _Choice:
@@ -173,6 +183,22 @@ class GcpStage:
         why = f"switched, Q {best.q:.2f} against {kept.q:.2f} of {_describe(self._roads, kept)}"
         gap_m = float(np.linalg.norm(self._roads.xyz_m[best.node] - np.array(self._target.xyz_m)))
         return _Choice(best, f"{says}; {why}", gap_m > self.config.same_target_m, shown)
+
+    def _keep_or_switch_tour(self, options: list[Option], held: list[int], tour: Outlook) -> _Choice:
+        """Keep the target unless a tour that begins elsewhere is better by both margins."""
+        shown = tuple(options[: self.config.alternatives])
+        best = next((option for option in options if option.node == tour.first), options[0])
+        kept = next((option for option in options if option.node in held), None)
+        says = f"{_describe(self._roads, best)}; begins a tour worth {tour.value:.1f}"
+        if kept is None:
+            return _Choice(best, says, alternatives=shown)
+        c = self.config
+        margin = max(c.tour_margin, c.tour_margin_relative * abs(tour.kept_value))
+        if best.node == kept.node or tour.value <= tour.kept_value + margin:
+            return _Choice(kept, f"{_describe(self._roads, kept)}; kept", alternatives=shown)
+        why = f"switched, against {tour.kept_value:.1f} by {_describe(self._roads, kept)} first"
+        gap_m = float(np.linalg.norm(self._roads.xyz_m[best.node] - np.array(self._target.xyz_m)))
+        return _Choice(best, f"{says}; {why}", gap_m > c.same_target_m, shown)
 
     def _margin(self, kept: Option, best: Option) -> float:
         """How much better the best must be. For a crumb, whole ground is not left unseen, nor what lies before it."""

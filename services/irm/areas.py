@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from services.irm.tiles import TileLayer
@@ -12,6 +14,7 @@ class Areas:
     """Counts of two layers in `map`: a step costs what it has changed, not what there is."""
 
     def __init__(self, ground: TileLayer, coverage: TileLayer, covered_log_odds: float) -> None:
+        """covered_log_odds: from which a cell is covered; -inf: as soon as it is known."""
         self._ground, self._coverage, self._bound = ground, coverage, covered_log_odds
         self._counts: dict[tuple[int, int], tuple[int, int]] = {}
         self._reachable = self._covered = 0
@@ -31,5 +34,7 @@ class Areas:
         if ground is None:
             return 0, 0
         mask = ground == GROUND
+        if self._bound == -math.inf:
+            return int(np.count_nonzero(mask)), int(np.count_nonzero(mask))
         covered = 0 if coverage is None else int(np.count_nonzero(mask & (coverage >= self._bound)))
         return int(np.count_nonzero(mask)), covered

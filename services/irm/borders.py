@@ -45,6 +45,8 @@ def find_frontiers(window: Window, config: Config, least: float | None = None) -
     """
     s = window.spec
     labels = np.zeros(s.shape, np.int32)
+    if config.coverage == "known":
+        return _find_behind(window, config, labels, config.frontier_min_gain if least is None else least)
     openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
     openings &= near_robot(window, config.opening_range_m)
     open_ground = (window.uncovered & (window.state == FREE)) | openings
@@ -74,6 +76,26 @@ def find_frontiers(window: Window, config: Config, least: float | None = None) -
     # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
     gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
     return _select(gain, opening, places, piece_of, window, least)
+
+
+def _find_behind(window: Window, config: Config, labels: NDArray[np.int32], least: float) -> list[Found]:
+    """The frontiers of `coverage: known`: blocks of the unknown behind the border, each with its expected gain."""
+    s, wanted = window.spec, window.uncovered
+    pieces = label_components(wanted, labels)
+    block = np.full(s.shape, -1, np.int32)
+    cells = max(1, round(config.frontier_block_m / s.resolution_m))
+    blocks = mark_borders(
+        wanted, window.reachable, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block
+    )
+    if blocks == 0:
+        return []
+    spread_blocks(wanted, block, round(config.frontier_reach_m / s.resolution_m), blocks)
+    gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
+    block_gains(window.entropy, np.zeros(s.shape, np.int32), np.zeros(0, np.int64), block, gain, sums, hidden)
+    places = block_places(window.reachable, block, sums, max(1, round(1.0 / s.resolution_m)))
+    piece_of = np.zeros(blocks, np.int64)
+    piece_of[block[block >= 0]] = labels[block >= 0]
+    return _select(gain, np.zeros(blocks, np.bool_), places, piece_of, window, least)
 
 
 def near_robot(window: Window, range_m: float) -> NDArray[np.bool_]:

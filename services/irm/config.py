@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -27,6 +28,21 @@ class Config(BaseModel):
         ge=0,
         le=0.69,
         description="Patches with less entropy count as covered, nats (a whole one: 0.69).",
+    )
+    # what covers
+    coverage: Literal["sensor", "known"] = Field(
+        "sensor",
+        description="sensor: known ground counts as covered when it was looked at; known: as soon as it is known.",
+    )
+    unknown_depth_m: float = Field(
+        4.0, gt=0, le=100, description="coverage known: unknown ground so deep behind the known counts, m,"
+    )
+    unknown_decay_m: float = Field(
+        4.0, gt=0, le=1000, description="less with its depth: exp(-depth / this), m."
+    )
+    unknown_solid: bool = Field(
+        True,
+        description="Unseen cells count amid unseen ones only: gaps between far rays are none. False: all.",
     )
     # coverage sensor, as the planners assume it
     sensor_range_m: float = Field(6.0, gt=0, le=100, description="Range of the coverage sensor, m.")

@@ -24,6 +24,8 @@ Key = int | tuple[int, int]
 class RoadGraph:
     """Nodes with x, y, z, kind, gain, coverage; edges with distance, risk, driven. All changes go through here.
 
+    Beside these an edge that was driven may have a way (see `set_way`).
+
     A round costs what it changes and what lies near, not what there is.
     """
 
@@ -108,6 +110,12 @@ class RoadGraph:
         self._changed.add((min(a, b), max(a, b)))
         if is_new and self._is_crumb(a) and self._is_crumb(b):
             self._components.join(a, b)
+
+    def set_way(self, a: int, b: int, way: list[float]) -> None:
+        """Where the robot went from a to b, as shares seen from them (`driven.seen_from`)."""
+        if a > b:  # the line turned round: 1 - t along it, and -s across
+            way = [1.0 - v if i % 2 == 0 else -v for i, v in enumerate(way)]
+        self.graph.edges[a, b]["way"] = way
 
     def drop_edge(self, a: int, b: int) -> None:
         """Remove an edge."""
@@ -257,3 +265,5 @@ class RoadGraph:
                 self.graph.nodes[node]["joined_at"] = tuple(d["joined_at"])
         for a, b, d in state["edges"]:
             self.set_edge(a, b, d["distance"], d["risk"], d["driven"])
+            if "way" in d:
+                self.graph.edges[a, b]["way"] = d["way"]

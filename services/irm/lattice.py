@@ -161,6 +161,58 @@ def _label_lattice(
 
 
 @njit
+def _straight_edges(
+    free_space: NDArray[np.bool_],
+    clearance_m: NDArray[np.float32],
+    hazard: NDArray[np.float32],
+    needed_m: float,
+    resolution_m: float,
+    ix0: int,
+    iy0: int,
+    size: int,
+    state: NDArray[np.uint8],
+    anchor_m: NDArray[np.float64],
+    label: NDArray[np.int64],
+    node: int,
+    distance_m: NDArray[np.float32],
+    risk: NDArray[np.float32],
+    pending: NDArray[np.int64],
+) -> bool:
+    """The straight edges of a node in the directions 0 .. 3. pending: (4,) out, 1 where none fits. Whether any is."""
+    some = False
+    for k in range(4):
+        pending[k] = 0
+        r, c = node // size + _DY[k], node % size + _DX[k]
+        if r < 0 or c < 0 or r >= size or c >= size or state[r * size + c] != 1:
+            continue
+        other = r * size + c
+        if label[other] == label[node]:
+            continue
+        x0, y0, x1, y1 = anchor_m[node, 0], anchor_m[node, 1], anchor_m[other, 0], anchor_m[other, 1]
+        if segment_min_clearance(clearance_m, resolution_m, ix0, iy0, x0, y0, x1, y1) >= needed_m and line_in(
+            free_space, resolution_m, ix0, iy0, x0, y0, x1, y1
+        ):
+            d, h = segment_risk(hazard, resolution_m, ix0, iy0, x0, y0, x1, y1)
+            set_edge(node, other, k, d, h, distance_m, risk)
+        else:
+            pending[k], some = 1, True
+    return some
+
+
+@njit
+def _line_of(
+    parent: NDArray[np.int32], row: int, column: int, resolution_m: float, ix0: int, iy0: int
+) -> NDArray[np.float64]:
+    """The centres of the cells on the way to a cell, (n, 2) m."""
+    cells = trace_path(parent, row, column)
+    line = np.empty((cells.shape[0], 2), np.float64)
+    for i in range(cells.shape[0]):
+        line[i, 0] = (ix0 + cells[i, 1] + 0.5) * resolution_m
+        line[i, 1] = (iy0 + cells[i, 0] + 0.5) * resolution_m
+    return line
+
+
+@njit
 def _connect(
     free_space: NDArray[np.bool_],
     clearance_m: NDArray[np.float32],
@@ -187,27 +239,15 @@ def _connect(
     cost = np.empty(free_space.shape, np.float64)
     parent = np.empty(free_space.shape, np.int32)
     points = bent_start[bent]
+    pending = np.zeros(4, np.int64)
     for node in range(size * size):
         if state[node] != 1:
             continue
         row, column = node // size, node % size
-        pending = np.zeros(4, np.int64)
-        for k in range(4):
-            r, c = row + _DY[k], column + _DX[k]
-            if r < 0 or c < 0 or r >= size or c >= size or state[r * size + c] != 1:
-                continue
-            other = r * size + c
-            if label[other] == label[node]:
-                continue
-            x0, y0, x1, y1 = anchor_m[node, 0], anchor_m[node, 1], anchor_m[other, 0], anchor_m[other, 1]
-            if segment_min_clearance(
-                clearance_m, resolution_m, ix0, iy0, x0, y0, x1, y1
-            ) >= needed_m and line_in(free_space, resolution_m, ix0, iy0, x0, y0, x1, y1):
-                d, h = segment_risk(hazard, resolution_m, ix0, iy0, x0, y0, x1, y1)
-                set_edge(node, other, k, d, h, distance_m, risk)
-            else:
-                pending[k] = 1
-        if pending.sum() == 0:
+        if not _straight_edges(
+            free_space, clearance_m, hazard, needed_m, resolution_m, ix0, iy0, size, state, anchor_m, label, node,
+            distance_m, risk, pending,
+        ):  # fmt: skip
             continue
         start_c = math.floor(anchor_m[node, 0] / resolution_m) - ix0
         start_r = math.floor(anchor_m[node, 1] / resolution_m) - iy0
@@ -234,11 +274,7 @@ def _connect(
             inside = box[0] <= end_r < box[1] and box[2] <= end_c < box[3]
             if not inside or not math.isfinite(cost[end_r, end_c]):
                 continue
-            cells = trace_path(parent, end_r, end_c)
-            line = np.empty((cells.shape[0], 2), np.float64)
-            for i in range(cells.shape[0]):
-                line[i, 0] = (ix0 + cells[i, 1] + 0.5) * resolution_m
-                line[i, 1] = (iy0 + cells[i, 0] + 0.5) * resolution_m
+            line = _line_of(parent, end_r, end_c, resolution_m, ix0, iy0)
             d, h = path_hazard(line, hazard, resolution_m, ix0, iy0)
             straight = math.hypot(
                 anchor_m[other, 0] - anchor_m[node, 0], anchor_m[other, 1] - anchor_m[node, 1]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.grid import UNKNOWN
+from planning.grid import FREE, UNKNOWN
 from planning.kernels import njit
 from planning.rays import visible_mass
 from planning.sight import visible_mass_over
@@ -49,7 +49,7 @@ class LocalIrmBuilder:
             c.spacing_m, s.ix0, s.iy0, c.size, c.edge_detour, state, anchor, distance, risk,
             bent_edge, bent_start, bent_xy,
         )  # fmt: skip
-        entropy = self._patch_sum(window, window.entropy, ix0, iy0)[0].astype(np.float32)
+        entropy = self._patch_sum(window, window.entropy, ix0, iy0, window.uncovered)[0].astype(np.float32)
         entropy[entropy < c.min_node_entropy] = 0.0
         reach = math.ceil(c.sensor_range_m / c.spacing_m)
         self.version += 1
@@ -143,7 +143,10 @@ class LocalIrmBuilder:
         half = ((s.height - skip_y) // 2, (s.width - skip_x) // 2)
         opaque, mass = np.zeros(half, np.bool_), np.zeros(half, np.float32)
         part = (slice(skip_y, None), slice(skip_x, None))
-        halve(window.state[part] != 1, window.entropy[part] * window.uncovered[part], opaque, mass)
+        hides = window.state != FREE
+        if c.coverage == "known":
+            hides &= ~window.hopeful  # the sensor will look into what turns out to be free
+        halve(hides[part], window.entropy[part] * window.uncovered[part], opaque, mass)
         ground, top = _NO_HEIGHTS, _NO_HEIGHTS
         if window.top_m is not None:
             ground, top = np.zeros(half, np.float32), np.zeros(half, np.float32)

@@ -12,6 +12,7 @@ from planning.frames import Planar
 from schemas.base import Pose
 from schemas.world import BREADCRUMB, FRONTIER, GlobalIrm
 from services.irm.config import Config
+from services.irm.driven import REFUTED, Trail, placed
 from services.irm.frontiers import ISOLATED, Frontier, FrontierManager
 from services.irm.graph import ROBOT, RoadGraph
 from services.irm.keyframes import Anchor
@@ -47,6 +48,8 @@ class Roadmap:
     next_id: int = 1
     version: int = 0
     last_breadcrumb: int = -1
+    trail: Trail = field(default_factory=Trail)
+    refuted: dict[tuple[int, int], int] = field(default_factory=dict)
     _doubtful: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
@@ -81,6 +84,7 @@ class Roadmap:
         search = Search(window)
         search.run(window.robot_cell, 3.0 * self.config.max_edge_m)
         self._place_robot(window, x_m, y_m)
+        self.trail.note(x_m, y_m)
         self._drop_breadcrumb(search, x_m, y_m, anchor)
         self._sync_frontiers(window)
         self._join_robot(search)
@@ -90,6 +94,7 @@ class Roadmap:
 
     def follow(self, keyframes: dict[int, Planar]) -> None:
         """Move what belongs to keyframes that SLAM has moved (new poses in `map`)."""
+        self.trail = Trail()
         frontiers = [n for n in self.manager.follow(keyframes) if n in self.graph]
         crumbs = self.road.belonging(keyframes)
         before = {
@@ -159,6 +164,7 @@ class Roadmap:
             d, rho = straight * 1.1, 0.05
         if straight <= 2.0 * self.config.max_edge_m:
             self.road.set_edge(a, b, max(d, straight), rho, 1)
+            self.road.set_way(a, b, self.trail.hand_over(self.road.place(a), self.road.place(b)))
 
     def _join(self, a: int, b: int, search: Search) -> bool:
         """Evaluate the edge a-b from the search that starts at a; add or remove it (Algorithm 1)."""
@@ -167,19 +173,32 @@ class Roadmap:
         if d < self.config.max_edge_m and rho < self.config.max_edge_risk and not self._stacked(a, b):
             driven = self.graph.edges[a, b]["driven"] if self.graph.has_edge(a, b) else 0
             self.road.set_edge(a, b, self._climbed_m(a, b, d), rho, driven)
+            self.refuted.pop((min(a, b), max(a, b)), None)
             return True
         if not (self.graph.has_edge(a, b) and search.knows(*target)):
             return False
         held = self.graph.edges[a, b]
+        if math.isfinite(d):
+            self.refuted.pop((min(a, b), max(a, b)), None)
         if held["driven"] and d < 2.0 * self.config.max_edge_m and not self._stacked(a, b):
             # Riskier than thought, perhaps, but it leads there: the robot must not be cut off from where it came from.
             self.road.set_edge(a, b, self._climbed_m(a, b, d), min(rho, _MOST_RISK), 1)
             return True
         # No way within the window is no evidence against a way that the robot has driven: it may lead around outside.
         misplaced = search.is_lethal(*place) or search.is_lethal(*target)
-        if not self.graph.edges[a, b]["driven"] or (search.obstacle_between(place, target) and not misplaced):
+        if not held["driven"] or (not misplaced and self._is_refuted(a, b, search)):
             self.road.drop_edge(a, b)
         return False
+
+    def _is_refuted(self, a: int, b: int, search: Search) -> bool:
+        """Whether something stands, time after time, where the robot went from a to b."""
+        low, high = (self.road.place(n) for n in (min(a, b), max(a, b)))
+        held = self.graph.edges[a, b]
+        way = placed(low, high, held["way"]) if held.get("way") else [low, high]
+        times = self.refuted.pop((min(a, b), max(a, b)), 0) + 1
+        if search.obstacle_on(way) and times < REFUTED:
+            self.refuted[min(a, b), max(a, b)] = times
+        return search.obstacle_on(way) and times >= REFUTED
 
     def _stacked(self, a: int, b: int) -> bool:
         """Whether two nodes lie on floors above one another."""
@@ -324,11 +343,15 @@ class Roadmap:
         return {
             "manager": self.manager.state(),
             "counters": [self.next_id, self.version, self.last_breadcrumb],
+            "trail": self.trail.points,
+            "refuted": sorted([*edge, times] for edge, times in self.refuted.items()),
         }
 
     def _set_beside_graph(self, state: dict[str, Any]) -> None:
         self.manager.set_state(state["manager"])
         self.next_id, self.version, self.last_breadcrumb = state["counters"]
+        self.trail.points = [(x, y) for x, y in state.get("trail", ())]  # older journals have none
+        self.refuted = {(a, b): times for a, b, times in state.get("refuted", ())}
 
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +52,11 @@ class Search:
         row, column = self._window.cell(x_m, y_m)
         return self._window.spec.contains(row, column) and self._window.state[row, column] != 0
 
-    def obstacle_between(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
-        """Whether a lethal cell lies on the straight line between two points."""
+    def obstacle_on(self, line: Sequence[tuple[float, float]]) -> bool:
+        """Whether a lethal cell lies on a line of points."""
+        return any(self._obstacle_between(a, b) for a, b in pairwise(line))
+
+    def _obstacle_between(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
         spec, state = self._window.spec, self._window.state
         steps = max(1, math.ceil(2.0 * math.dist(a, b) / spec.resolution_m))
         for i in range(steps + 1):

@@ -13,7 +13,7 @@ from planning.grid import UNKNOWN
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
 from schemas.operation import MissionPhase
-from schemas.policy import GlobalPolicy
+from schemas.policy import LocalPhase
 from schemas.sensing import CoverageScan, Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import (
@@ -25,6 +25,7 @@ from schemas.topics import (
     GLOBAL_IRM,
     GLOBAL_POLICY,
     LOCAL_IRM,
+    LOCAL_POLICY,
     MISSION,
     MISSION_GRAPH_REQUEST,
     ODOMETRY,
@@ -43,6 +44,7 @@ from services.irm.out_of_reach import TOO_NARROW, OutOfReach
 from services.irm.resample import moved
 from services.irm.roadmap import Roadmap
 from services.irm.tiles import TileLayer
+from services.irm.unknown import expected_area_m2
 from services.irm.window import Window, build_window, grid_of, read_layer, relief_of, window_picture
 
 __all__ = ["Config", "IrmStage", "create", "spec"]
@@ -53,6 +55,7 @@ _BLOCKED_MOST = 2
 """and so often at most: a door that was touched is risky, not shut."""
 _DOUBT_WINDOWS = 1.25
 """Keyframes within so many widths of the window are asked for their certainty: what they saw may lie in it."""
+_HELPLESS_TIMES = 6.0
 _MAX_PENDING = 50
 _MOVES_MPS = 0.02
 _PROGRESS_M2 = 0.3
@@ -126,8 +129,7 @@ class IrmStage:
         ]
         due = now - self._global_ns >= self._config.global_period_s * SECOND_NS - SECOND_NS // 100
         if due or asked:
-            policy = inputs.current(GLOBAL_POLICY)
-            found += self._global(now, window, odometry, bool(asked), policy, _exploring(inputs))
+            found += self._global(now, window, odometry, bool(asked), inputs)
         return found
 
     def _allocate(self, risk: RiskMap) -> None:
@@ -140,7 +142,8 @@ class IrmStage:
         self._coverage = TileLayer("float32", 0.0, resolution_m)
         self._store = FootprintStore(self._coverage)
         self._ground_store = GroundStore(self._ground)
-        self._areas = Areas(self._ground, self._coverage, math.log(p / (1.0 - p)))
+        bound = -math.inf if self._config.coverage == "known" else math.log(p / (1.0 - p))
+        self._areas = Areas(self._ground, self._coverage, bound)
         self._local = LocalIrmBuilder(self._config, radius_m, version)
 
     def _read_pose_graph(self, inputs: Inputs) -> None:
@@ -231,13 +234,14 @@ class IrmStage:
         window: Window,
         odometry: Odometry,
         whole: bool,
-        policy: GlobalPolicy | None,
-        exploring: bool,
+        inputs: Inputs,
     ) -> Outputs:
         # Neither the first round, nor a gap in the inputs, nor a pause is time that the robot stood beside a frontier.
         since = (now - self._global_ns) / SECOND_NS
         elapsed = (
-            min(since, 2.0 * self._config.global_period_s) if self._global_ns >= 0 and exploring else 0.0
+            min(since, 2.0 * self._config.global_period_s)
+            if self._global_ns >= 0 and _exploring(inputs)
+            else 0.0
         )
         self._global_ns = now
         place = self._place(odometry)
@@ -249,8 +253,7 @@ class IrmStage:
         if covered_m2 >= self._covered_m2 + _PROGRESS_M2:
             self._covered_m2 = covered_m2
             self._roadmap.manager.progressed()
-        if policy is not None:
-            self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, elapsed)
+        self._pursue(now, inputs, elapsed)
         self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, ground_m2, anchor, self._doubtful)
         first = self._roadmap.version == 0
         message = self._roadmap.message(odometry.pose, self._frame_pose(odometry), now, whole or first)
@@ -262,6 +265,16 @@ class IrmStage:
             Output(COVERAGE_WINDOW, CoverageWindow(stamp_ns=now, grid=header, cell=picture)),
         ]
 
+    def _pursue(self, now: Stamp, inputs: Inputs, elapsed_s: float) -> None:
+        """The time that the robot has been after its target; where the local planner finds no way there, it goes on
+        several times as fast: the robot would only go to and fro."""
+        policy, local = inputs.current(GLOBAL_POLICY), inputs.current(LOCAL_POLICY)
+        if policy is None:
+            return
+        helpless = local is not None and local.phase == LocalPhase.NONE and local.target == policy.target
+        times = _HELPLESS_TIMES if helpless and policy.target >= 0 else 1.0
+        self._roadmap.manager.pursue(policy.target, policy.target_distance_m, now, times * elapsed_s)
+
     def _frame_pose(self, odometry: Odometry) -> Pose:
         """Pose of `odom` in `map` that the graph goes by."""
         frame, told = self._odom.pose, odometry.map_to_odom
@@ -271,15 +284,18 @@ class IrmStage:
         given_up = [(g.x_m, g.y_m, g.gain, g.reason) for g in self._roadmap.manager.given_up]
         given_up += [(p.x_m, p.y_m, p.gain, TOO_NARROW) for p in self._out_of_reach.places]
         frontiers = self._roadmap.manager.frontiers
+        left = float(sum(f.gain for f in frontiers.values()))
+        if self._config.coverage == "known":  # what is known is covered; what is expected behind it is not
+            reachable += expected_area_m2(left, self._config.spacing_m)
         return CoverageSummary(
             stamp_ns=now,
             irm_version=max(self._roadmap.version, 1),
             reachable_area_m2=reachable,
             covered_area_m2=covered,
             covered_fraction=covered / reachable if reachable else 0.0,
-            entropy_left=float(sum(f.gain for f in frontiers.values())) + self._roadmap.manager.dropped_gain,
+            entropy_left=left + self._roadmap.manager.dropped_gain,
             frontiers=len(frontiers),
-            frontier_gain=float(sum(f.gain for f in frontiers.values())),
+            frontier_gain=left,
             breadcrumbs=self._roadmap.breadcrumbs(),
             settled=not frontiers and reachable > 0.0,
             unreachable_xy_m=np.array([place[:2] for place in given_up], dtype=np.float64).reshape(-1, 2),

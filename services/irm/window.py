@@ -20,6 +20,7 @@ from services.irm.config import Config
 from services.irm.keyframes import IDENTITY
 from services.irm.resample import bounds, resample
 from services.irm.tiles import TileLayer
+from services.irm.unknown import KNOWN_PROBABILITY, expected_gain
 
 KNOWN, GROUND = 2, 1
 """Of the ground layer: seen but out of the robot's reach or an obstacle; ground that it can touch. 0: never seen."""
@@ -40,7 +41,8 @@ class Window:
     hopeful: never seen (not only forgotten by the risk map), but the robot's centre may fit there and get there, as
     far as obstacles are known. free_space: its centre fits, and gets there over known ground; reachable: or over
     forgotten ground. ground: what its body can touch from there. uncovered: ground below the covered
-    probability, slivers of one cell left out. entropy: of uncovered cells, nats of whole patches (0 elsewhere).
+    probability, slivers of one cell left out; with `coverage: known` the hopeful ground behind the border of the known
+    (see `unknown`). entropy: of uncovered cells, nats of whole patches (0 elsewhere).
     top_m: what the coverage sensor has to look over; None: whatever is not free blocks the sight.
     hazard: CVaR of the hazard rate, its mean under the body, 1/m. step_cost: cost per metre of the grid search.
     """
@@ -151,12 +153,19 @@ def build_window(
     layer[risk.state != UNKNOWN] = KNOWN
     layer[ground] = GROUND
     unseen = layer == 0
-    hopeful = solid(unseen) & (risk.clearance_m >= needed)
+    hopeful = (solid(unseen) if config.unknown_solid else unseen) & (risk.clearance_m >= needed)
     hopeful &= connected_free_space(reachable | hopeful, robot)
-    p = probability(log_odds)
-    uncovered = without_slivers(ground & (p < config.covered_probability))
     cell_share = (g.resolution_m / config.spacing_m) ** 2
-    cell_entropy = np.where(uncovered, entropy(p) * np.float32(cell_share), np.float32(0.0))
+    if config.coverage == "known":
+        p = np.where(unseen, np.float32(0.5), np.float32(KNOWN_PROBABILITY))
+        cell_entropy = expected_gain(
+            reachable, hopeful, g.resolution_m, config.unknown_depth_m, config.unknown_decay_m, cell_share
+        )
+        uncovered = cell_entropy > 0.0
+    else:
+        p = probability(log_odds)
+        uncovered = without_slivers(ground & (p < config.covered_probability))
+        cell_entropy = np.where(uncovered, entropy(p) * np.float32(cell_share), np.float32(0.0))
     return Window(
         spec=spec,
         state=risk.state,

@@ -198,7 +198,8 @@ class LcpStage:
                 reason = f"guides to target {policy.target}"
                 return _policy(now, request, irm, LocalPhase.GUIDE, reason, policy, junction, moves, 0,
                                _EMPTY_TREE, policy.target_q, 0, 0)  # fmt: skip
-        return _nothing(now, request, f"no way to target {policy.target} in the Local IRM")
+        reason = f"no way to target {policy.target} in the Local IRM"
+        return _nothing(now, request, reason, policy.target)
 
     def snapshot(self) -> bytes:
         """The phase, the last episode, the Local IRMs that the next one may name, and what was promised; a search
@@ -292,7 +293,8 @@ def _policy(
     )
 
 
-def _nothing(now: Stamp, request: EpisodeRequest, reason: str) -> LocalPolicy:
+def _nothing(now: Stamp, request: EpisodeRequest, reason: str, target: int = -1) -> LocalPolicy:
+    """No way; target: the one to which there is none."""
     none = np.zeros(0)
     return LocalPolicy(
         stamp_ns=now,
@@ -300,7 +302,7 @@ def _nothing(now: Stamp, request: EpisodeRequest, reason: str) -> LocalPolicy:
         irm_version=request.irm_version,
         phase=LocalPhase.NONE,
         reason=reason,
-        target=-1,
+        target=target,
         root_value=0.0,
         rollout_value=0.0,
         simulations=0,

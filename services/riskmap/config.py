@@ -11,6 +11,9 @@ from planning.robot_profile import PROFILES, SPOT
 _BELLY_SHARE = 0.35
 """Roughness (rms under the robot's disc) that is a limit, as a share of the height under its belly."""
 
+MAX_SIDE_CELLS = 800
+"""Of a window: a risk map has 25 bytes a cell, and a message at most 16 MiB."""
+
 
 class Config(BaseModel):
     """Configuration of riskmap; unknown keys are refused. `profile` sets the defaults of the robot's fields."""
@@ -172,6 +175,15 @@ class Config(BaseModel):
             "max_roughness_m": _BELLY_SHARE * profile.belly_m,
         }
         return {**own, **data}
+
+    @model_validator(mode="after")
+    def _check_size(self) -> Config:
+        if self.window_m / self.resolution_m > MAX_SIDE_CELLS:
+            raise ValueError(
+                f"window_m / resolution_m: {self.window_m / self.resolution_m:.0f} cells a side are more than the "
+                f"{MAX_SIDE_CELLS} that fit into a risk map's message; take larger cells or a smaller window"
+            )
+        return self
 
     @property
     def alpha(self) -> float:

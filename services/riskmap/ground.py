@@ -142,11 +142,12 @@ def walk(
                 continue
             r = sweep.low_distance[b, k]
             row, column = slot(rules, cells.shape[0], cells.shape[1], sweep.sensor[0] + r * dx, sweep.sensor[1] + r * dy)  # fmt: skip  # noqa: E501
-            known, mean = False, np.float32(0.0)
+            known, mean, gap = False, np.float32(0.0), r - last_r
             if row >= 0:
+                # Much lower than what leads there it is the ground of another storey, unless a slope may lie between.
                 mean = cells[row, column, MEAN]
-                known = cells[row, column, SEEN] >= _TRUSTED_POINTS and mean > last_z - rules.height_m
-            gap = r - last_r
+                lower = rules.height_m + _STEEP * gap
+                known = cells[row, column, SEEN] >= _TRUSTED_POINTS and mean > last_z - lower
             if known:
                 drift = rules.drift_per_m * (rules.travelled_m - cells[row, column, TRAVELLED])
                 gate = max(rules.step_m, 3.0 * math.sqrt(cells[row, column, VARIANCE] + drift * drift))

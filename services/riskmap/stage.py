@@ -25,6 +25,8 @@ __all__ = ["Config", "RiskMapStage", "create", "spec", "warm_up"]
 _FUTURE_NS = SECOND_NS // 2
 """A message stamped further ahead of the clock is wrong; taken, it would make every right one look old."""
 
+_MOVING_POINTS = 8192
+
 
 def spec(config: Config) -> StageSpec:
     """How to run the stage: at the clouds' rate."""
@@ -122,7 +124,7 @@ class RiskMapStage:
                 self._news |= taken
                 if taken:
                     found.append(
-                        Output(MOVING, MovingPoints(stamp_ns=self._stamp_ns, points_m=self._model.moving_m))
+                        Output(MOVING, MovingPoints(stamp_ns=self._stamp_ns, points_m=self._moving_m()))
                     )
         for grid in inputs.new(READY_GRID):
             if self._timely(now, grid.message):
@@ -169,6 +171,14 @@ class RiskMapStage:
         self.bad_points += self._model.integrate(cloud)
         self._stamp_ns = cloud.stamp_ns
         return True
+
+    def _moving_m(self) -> NDArray[np.float32]:
+        """What moves, the nearest first where it is more than a message holds: those the robot has to brake for."""
+        points_m = self._model.moving_m
+        if len(points_m) <= _MOVING_POINTS:
+            return points_m
+        away_m = np.hypot(points_m[:, 0] - self._pose.x_m, points_m[:, 1] - self._pose.y_m)
+        return points_m[np.argsort(away_m, kind="stable")[:_MOVING_POINTS]]
 
     def _risk_map(self, now: Stamp, stamp_ns: int) -> RiskMap:
         layers, elevation_m = self._model.layers(self._pose)

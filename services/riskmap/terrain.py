@@ -180,24 +180,42 @@ def _fit_planes(
                 sv += part[7]
             if n < _LEAST_SHARE * full:
                 continue
-            mx, my, mz = sx / s, sy / s, sz / s
-            cxx, cxy, cyy = sxx / s - mx * mx, sxy / s - mx * my, syy / s - my * my
-            half = 0.5 * (cxx + cyy)
-            least = half - math.sqrt(max(0.25 * (cxx - cyy) ** 2 + cxy * cxy, 0.0))
-            if least < (_LEAST_SPREAD * radius_m) ** 2:
-                continue
-            cxz, cyz = sxz / s - mx * mz, syz / s - my * mz
-            determinant = cxx * cyy - cxy * cxy
-            gx = (cxz * cyy - cyz * cxy) / determinant
-            gy = (cyz * cxx - cxz * cxy) / determinant
-            residual = max(szz / s - mz * mz - gx * cxz - gy * cyz, 0.0)
-            steepness = math.sqrt(gx * gx + gy * gy)
-            own = sv / s / min(n, _INDEPENDENT)
-            fitted[r, c] = True
-            out[0, r, c] = math.atan(steepness)
-            out[1, r, c] = (own + residual / n) / (least * shrink) / (1.0 + steepness * steepness) ** 2
-            out[2, r, c] = math.sqrt(residual)
-            out[3, r, c] = own
+            _plane(
+                (n, s, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz, sv), (_LEAST_SPREAD * radius_m) ** 2, shrink,
+                r, c, fitted, out,
+            )  # fmt: skip
+
+
+@njit
+def _plane(
+    sums: tuple[float, ...],
+    least_spread: float,
+    shrink: float,
+    r: int,
+    c: int,
+    fitted: NDArray[np.bool_],
+    out: NDArray[np.float32],
+) -> None:
+    """The plane of a cell from its sums: number, w, w x, w y, w z, w xx, w xy, w yy, w xz, w yz, w zz, w variance."""
+    n, s, sx, sy, sz, sxx, sxy, syy, sxz, syz, szz, sv = sums
+    mx, my, mz = sx / s, sy / s, sz / s
+    cxx, cxy, cyy = sxx / s - mx * mx, sxy / s - mx * my, syy / s - my * my
+    half = 0.5 * (cxx + cyy)
+    least = half - math.sqrt(max(0.25 * (cxx - cyy) ** 2 + cxy * cxy, 0.0))
+    if least < least_spread:
+        return
+    cxz, cyz = sxz / s - mx * mz, syz / s - my * mz
+    determinant = cxx * cyy - cxy * cxy
+    gx = (cxz * cyy - cyz * cxy) / determinant
+    gy = (cyz * cxx - cxz * cxy) / determinant
+    residual = max(szz / s - mz * mz - gx * cxz - gy * cyz, 0.0)
+    steepness = math.sqrt(gx * gx + gy * gy)
+    own = sv / s / min(n, _INDEPENDENT)
+    fitted[r, c] = True
+    out[0, r, c] = math.atan(steepness)
+    out[1, r, c] = (own + residual / n) / (least * shrink) / (1.0 + steepness * steepness) ** 2
+    out[2, r, c] = math.sqrt(residual)
+    out[3, r, c] = own
 
 
 @njit

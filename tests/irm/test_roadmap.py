@@ -10,6 +10,8 @@ from typing import Any
 import networkx as nx
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from planning.frames import Planar
@@ -22,6 +24,8 @@ from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import GLOBAL_IRM
 from schemas.world import BREADCRUMB, FRONTIER, GlobalIrm
 from services.irm.config import Config
+from services.irm.driven import placed, seen_from
+from services.irm.graph import RoadGraph
 from services.irm.roadmap import ROBOT, Roadmap, path_totals
 from tests.irm.worlds import Belief, Flat, room, scan_at
 
@@ -90,6 +94,11 @@ class Drive:
         b = min(crumbs, key=lambda n: abs(crumbs[n][0] - b_x))
         assert a != b
         return self.roadmap.graph.edges.get((a, b))
+
+    def crosses(self, edge: tuple[int, int], x_m: float) -> bool:
+        """Whether the ends of an edge lie on both sides of x."""
+        a, b = (self.roadmap.graph.nodes[n]["x"] - x_m for n in edge)
+        return bool(a * b < 0.0)
 
 
 def check_edges(drive: Drive) -> None:
@@ -236,6 +245,51 @@ def test_an_edge_that_nobody_drove_also_stays_out_of_sight() -> None:
     assert edges
     drive.stay(20.0, 0.1)
     assert all(drive.roadmap.graph.has_edge(a, b) for a, b in edges)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_driven_way_round_a_corner_goes_only_when_something_stands_on_it(closed: bool) -> None:
+    """The robot went round a wall's end by a gap that then looks too narrow: the wall between is no news."""
+    drive = Drive(room(-1.0, -3.0, 9.0, 3.0, RES))
+    drive.flat.fill(3.8, -3.0, 4.2, 1.0, LETHAL)
+    way = [(3.0, -1.0), (3.0, 0.0), (3.0, 1.0), (3.4, 1.8), (4.2, 1.9), (5.0, 1.4), (5.0, 0.4), (5.0, -0.6)]
+    drive.to(1.0, -1.0)
+    for a, b in pairwise([(1.0, -1.0), *way]):
+        for share in (0.5, 1.0):
+            drive.to(a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]))
+    across = [
+        e for e in drive.roadmap.graph.edges
+        if ROBOT not in e and drive.crosses(e, 4.0) and drive.roadmap.graph.edges[e]["driven"]
+    ]  # fmt: skip
+    assert across
+    for y in (1.0, 2.2) if not closed else (1.0, 1.4, 1.8, 2.2, 2.6):
+        drive.flat.fill(3.8, y, 4.2, y + 0.4, LETHAL)
+    drive.flat.fill(3.8, 2.6, 4.2, 3.0, LETHAL)
+    drive.stay(5.0, -0.6)
+    assert [drive.roadmap.graph.has_edge(*e) for e in across] == [not closed] * len(across)
+
+
+@given(
+    ends=st.tuples(*[st.tuples(st.floats(-50, 50), st.floats(-50, 50))] * 2),
+    points=st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=8),
+)
+def test_a_way_seen_from_its_ends_lies_where_it_was(
+    ends: tuple[tuple[float, float], tuple[float, float]], points: list[tuple[float, float]]
+) -> None:
+    a, b = ends
+    shares = seen_from(a, b, points)
+    if math.dist(a, b) < 0.5:
+        assert shares == []
+        return
+    assert np.allclose(placed(a, b, shares), np.array(points).reshape(-1, 2), atol=1e-6)
+    road = RoadGraph()
+    for node, (x, y) in ((1, b), (2, a)):
+        road.set_node(node, x, y, 0.0, BREADCRUMB, 0.0, 1.0)
+    road.set_edge(2, 1, 1.0, 0.0, 1)
+    road.set_way(2, 1, shares)
+    assert np.allclose(
+        placed(b, a, road.graph.edges[1, 2]["way"]), np.array(points).reshape(-1, 2), atol=1e-6
+    )
 
 
 def test_edges_go_when_a_wall_is_seen_between_their_ends_and_come_back_with_the_ground() -> None:

@@ -13,6 +13,7 @@ from planning.frames import Planar
 from schemas.base import Message
 from schemas.codec import Envelope, decode, encode
 from schemas.contract import SECOND_NS, Inputs, Outputs, StageSetup, Topic
+from schemas.policy import LocalPhase, LocalPolicy
 from schemas.sensing import FollowerState
 from schemas.topics import (
     COVERAGE,
@@ -23,6 +24,7 @@ from schemas.topics import (
     GLOBAL_IRM,
     GLOBAL_POLICY,
     LOCAL_IRM,
+    LOCAL_POLICY,
     ODOMETRY,
     POSE_GRAPH,
     RISK_MAP,
@@ -32,6 +34,7 @@ from services.irm.stage import Config, IrmStage, create, spec
 from tests.irm.worlds import Flat, pose_graph, room, scan_at
 from tests.lcp.local_irms import global_policy
 from tests.riskmap.helpers import inputs, merged, odometry
+from tests.schemas.examples import example
 
 M = TypeVar("M", bound=Message)
 
@@ -288,3 +291,27 @@ def test_the_frontier_that_the_global_planner_pursues_in_vain_is_given_up(
     assert all(r == [] for r in reasons[:7]), "one round for the distance, then five seconds"
     assert (len(reasons[7]) == 1) == given_up
     assert all("no nearer" in r for r in reasons[7])
+
+
+@pytest.mark.parametrize(("says", "rounds"), [(0, 2), (1000, 7), (None, 7)])
+def test_time_in_vain_goes_faster_where_the_local_planner_finds_no_way(says: int | None, rounds: int) -> None:
+    """Five seconds in vain are over in one, if it is of this target that it says so."""
+    config = CONFIG.model_copy(update={"pursue_s": 5.0, "give_up_s": 600.0, "second_chance_gain": 999.0})
+    stage, flat = IrmStage(config), room(-4.0, -4.0, 4.0, 4.0, 0.2)
+    outputs = stage.step(0, feeds(flat, 0.5, 0.5))
+    graph = one(outputs, GLOBAL_IRM)
+    assert isinstance(graph, GlobalIrm)
+    target = int(graph.node_id[graph.node_kind == FRONTIER][0])
+    policy = global_policy([(0.5, 0.5), (3.0, 3.0)])
+    policy = policy.model_copy(update={"target": target, "target_distance_m": 4.0})
+    no_way = example(LocalPolicy).model_copy(
+        update={"phase": LocalPhase.NONE, "target": target + (says or 0)}
+    )
+    told = [inputs((LOCAL_POLICY, no_way))] if says is not None else []
+    for k in range(1, 9):
+        found = merged(feeds(flat, 0.5, 0.5), inputs((GLOBAL_POLICY, policy)), *told)
+        summary = one(stage.step(k * SECOND_NS, found), COVERAGE)
+        assert isinstance(summary, CoverageSummary)
+        if summary.unreachable_reason:
+            break
+    assert k == rounds

@@ -218,6 +218,27 @@ def test_ground_once_seen_is_not_taken_for_overhead_when_what_leads_there_is_mis
     assert at(model, layers_of(model, Pose()).state, 8.05, 0.1) == FREE
 
 
+def test_a_ceiling_seen_over_a_crest_is_not_taken_for_the_ground_that_lies_below() -> None:
+    """From the upper end of a slope, rays pass over its lower part and meet the ceiling beyond: z = 1 over -1.2."""
+    y = np.arange(-0.5, 0.5, 0.05)
+
+    def points(*places: tuple[float, float]) -> NDArray[np.float64]:
+        return np.concatenate([np.stack([0.0 * y + x, y, 0.0 * y + z], axis=1) for x, z in places])
+
+    upper = [(x, 0.0) for x in np.arange(2.0, 5.0, 0.05)]
+    lower = [(x, max(-1.2, -0.6 * (x - 5.0))) for x in np.arange(5.0, 9.0, 0.05)]
+    model = TerrainModel(config(profile="spot"))
+    for k in range(5):
+        model.integrate(sparse_cloud(points(*upper, *lower), k + 1))
+    before = at(model, cells_of(model)[MEAN], 8.05, 0.05)
+    for k in range(5):
+        model.integrate(sparse_cloud(points(*upper, (8.05, 1.0)), k + 6))
+    assert before == pytest.approx(-1.2, abs=0.05)
+    assert at(model, cells_of(model)[MEAN], 8.05, 0.05) == pytest.approx(before, abs=0.05)
+    assert at(model, cells_of(model)[CEILING], 8.05, 0.05) == pytest.approx(1.0, abs=0.05)
+    assert at(model, layers_of(model, Pose()).state, 8.05, 0.05) == FREE
+
+
 def test_a_beam_below_the_robots_height_is_an_obstacle() -> None:
     points = [(4.0 + 0.02 * k, 0.005 * j, 0.0) for k in range(5) for j in range(5)]
     beam = [(4.05, 0.005 * j, 0.7) for j in range(5)]
