@@ -59,7 +59,7 @@ def calls(text: str) -> list[tuple[str, str]]:
     found = []
     for line in code_lines(text):
         for call in re.split(r"[;&|]+", line):
-            match = re.search(r"(?:^|\s|/)plgrim ([a-z]+)\b(.*)", call)
+            match = re.search(r"(?:^|\s|/)(?<!from )plgrim ([a-z]+)\b(.*)", call)
             if match is not None:
                 found.append((match[1], match[2]))
     return found
