@@ -54,10 +54,11 @@ class CoverageModel(NamedTuple):
     particle_*: (p,), the root belief. covered: (size,) bits that count as covered already. row_low, row_high: (n,),
     the rows of the footprint that are not empty, half open. cluster_*: groups of uncovered nodes for the informed
     rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_rows (c, 3) words, cluster_top (c,) first row.
+    looks_on_turn: whether turning shows something new: not to a sensor that looks all around. It has looked from where
+    the robot stands; what the model still promises there would be seen from the node's anchor.
     horizon: moves of every simulation, in the tree and the rollout together, so that values of short and of long
-    actions compare. looks_on_turn: not for a sensor that sees all round: it has looked from where the robot stands, and
-    what a node still promises there would be seen from its anchor. all_round: such a sensor, and the root has looked;
-    fresh_most: (n, 8), then the most that a move can newly cover, having looked from its start.
+    actions compare. looked_around: the sensor looks all around and nothing that it sees from the root is uncovered.
+    fresh_most: (n, 8), then the most that a move can newly cover.
     """
 
     size: int
@@ -84,7 +85,7 @@ class CoverageModel(NamedTuple):
     horizon: int
     rollout_random: float
     looks_on_turn: bool
-    all_round: bool
+    looked_around: bool
     fresh_most: NDArray[np.int64]
 
 
@@ -230,7 +231,7 @@ def best_gain_direction(
         if distance <= 0.0 or (tried >> k) & 1 or edge_risk[node, k] > MAX_EDGE_RISK:
             continue
         cost, risk_cost = distance + 0.7 * _TURN[heading, k], k_risk * edge_risk[node, k]
-        if model.all_round and 0.5000001 * model.fresh_most[node, k] < (best_score + risk_cost) * cost:
+        if model.looked_around and 0.5000001 * model.fresh_most[node, k] < (best_score + risk_cost) * cost:
             continue
         other = step_to[node, k]
         gain = new_nodes(footprint, row_low, row_high, tops[other], other, k, covered)
@@ -666,7 +667,7 @@ def _has_looked(
     node: NDArray[np.int32],
     covered: NDArray[np.uint64],
 ) -> bool:
-    """Whether all that these nodes see all round is covered already."""
+    """Whether all that these nodes see all around is covered already."""
     for i in node:
         for r in range(footprint.shape[2]):
             row = top[i] + r
@@ -679,7 +680,7 @@ def _has_looked(
 def _fresh_most(
     footprint: NDArray[np.uint64], top: NDArray[np.int32], step_to: NDArray[np.int32]
 ) -> NDArray[np.int64]:
-    """(n, 8): how many nodes the end of an edge sees all round that its start does not."""
+    """(n, 8): how many nodes the end of an edge sees all around that its start does not."""
     n, rows = footprint.shape[0], footprint.shape[2]
     fresh = np.zeros((n, 8), np.int64)
     for node in range(n):
@@ -754,14 +755,14 @@ def build_model(
     )
     footprint = np.zeros((size * size, 8, 2 * reach + 1), np.uint64)
     _footprints(seen, wedge_rows(reach, fov_rad), size, reach, footprint)
-    all_round = fov_rad >= _FULL_TURN and bool(
-        _has_looked(footprint, top_row, root.node, np.array(root.covered))
+    looked = fov_rad >= _FULL_TURN and bool(
+        _has_looked(footprint, top_row, np.array(root.node), np.array(root.covered))
     )
-    fresh = _fresh_most(footprint, top_row, step_to) if all_round else np.zeros((0, 8), np.int64)
+    fresh = _fresh_most(footprint, top_row, step_to) if looked else np.zeros((0, 8), np.int64)
     return CoverageModel(
         size, reach, weights, step_to, top_row, distance, risk, weights.gamma_per_m ** distance.astype(np.float64),
         np.array(entropy), low, high, footprint, np.array(leaf_value),
         np.array(root.node), np.array(root.heading),
         np.array(root.weight), np.array(root.covered), move, cost, rows, top, horizon, rollout_random,
-        fov_rad < _FULL_TURN, all_round, fresh,
+        fov_rad < _FULL_TURN, looked, fresh,
     )  # fmt: skip

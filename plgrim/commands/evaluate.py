@@ -21,6 +21,6 @@ def register(app: typer.Typer) -> None:
     evaluate_missions.register(group)
     evaluate_paper.register(group)
     evaluate_tour.register(group)
-    evaluate_grid.register(group)
     evaluate_solvers.register(group)
+    evaluate_grid.register(group)
     app.add_typer(group)

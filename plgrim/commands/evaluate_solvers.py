@@ -54,18 +54,18 @@ def rocksample(
         _say(report(measure(layout, speed)))
 
 
-def _returns(size: tuple[int, int], published: bool, rows: list[tuple[str, float, float]]) -> None:
+def _returns(size: tuple[int, int], published: bool, rows: list[tuple[str, float, float | None]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from plgrim.evaluation.rocksample import PUBLISHED
+    from plgrim.evaluation.rocksample import PEERS
 
     table = Table(title=f"RockSample({size[0]}, {size[1]}): discounted return")
     for name in ("solver", "mean", "standard error"):
         table.add_column(name)
-    beside = PUBLISHED.get(size, ()) if published else ()
+    beside = PEERS.get(size, ()) if published else ()
     for source, mean, error in [*rows, *beside]:
-        table.add_row(source, f"{mean:.2f}", f"{error:.2f}")
+        table.add_row(source, f"{mean:.2f}", "" if error is None else f"{error:.2f}")
     Console().print(table)
 
 

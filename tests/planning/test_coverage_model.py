@@ -459,14 +459,14 @@ def test_rollouts_with_chance_stay_on_edges() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_what_an_all_round_sensor_skips_changes_nothing(seed: int) -> None:
-    """Having looked all round, turning shows nothing and moves are bounded by what they can newly show: the rule's
-    choice, the rewards and so the whole search are the same as without these short cuts."""
+def test_what_a_sensor_that_looks_all_around_skips_changes_nothing(seed: int) -> None:
+    """Having looked all around, moves are bounded by what they can newly show: the rule and so the search
+    are the same as without that short cut."""
     lattice = random_lattice(seed, 7, 2, 360.0, wall_share=0.15, risky_share=0.3, covered_share=0.2)
     start = sorted({node for node, _ in lattice.edges})[seed % 5]
     model = lattice.model(start, seed % 8, lattice.footprint(start, 0), rollout_random=0.1)
-    assert model.all_round
-    plain = model._replace(all_round=False)
+    assert model.looked_around
+    plain = model._replace(looked_around=False)
     trees = []
     for each in (model, plain):
         solver = coverage_solver(7, max_depth=12)
@@ -475,4 +475,4 @@ def test_what_an_all_round_sensor_skips_changes_nothing(seed: int) -> None:
     assert trees[0].visits.tolist() == trees[1].visits.tolist()
     assert trees[0].values.tolist() == trees[1].values.tolist()
     unseen = lattice.model(start, 0, (), rollout_random=0.1)
-    assert not unseen.all_round or not lattice.footprint(start, 0)
+    assert not unseen.looked_around or not lattice.footprint(start, 0)
