@@ -153,7 +153,12 @@ class Config(BaseSettings):
             section = {"footprint_radius_m": PROFILES[self.profile].footprint_radius_m, **section}
             if rough:
                 own = {"clearance_margin_m": self.options("irm")["clearance_margin_m"]}
-                section = {**own, "comfort_clearance_m": ROUGH_COMFORT_M, **section}
+                section = {
+                    **own,
+                    "comfort_clearance_m": ROUGH_COMFORT_M,
+                    "turn_room_m": ROUGH_TURN_ROOM_M,
+                    **section,
+                }
         if service == "riskmap" and rough:
             section.setdefault("model", "terrain")
         elif service == "gcp" and rough:
@@ -185,8 +190,10 @@ def is_rough(sim: Mapping[str, Any]) -> bool:
 DOWNWARD_LIDAR = {"rings": 24, "elevation_min_deg": -45.0, "elevation_max_deg": 15.0}
 """For rough ground: with the default, no ring meets the ground nearer than 3 m, nor any way down at all."""
 
-ROUGH_MARGIN_M = 0.05
+ROUGH_MARGIN_M = 0.1
 """Beside a stone, a foot that is so far off its place tips the robot; on flat ground a wall only stops it."""
+ROUGH_TURN_ROOM_M = 0.1
+"""The edge of a stone is known to a cell: beside it a turn on the spot may put a foot on it."""
 ROUGH_COMFORT_M = 0.6
 """Where there is room, paths keep so far off what may tip the robot."""
 

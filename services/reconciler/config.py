@@ -48,6 +48,12 @@ class Config(BaseModel):
     clearance_margin_m: float = Field(
         0.0, ge=0, le=1, description="Paths keep so much more off obstacles, m."
     )
+    turn_room_m: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="With less room than the disc and this it goes back before it turns on the spot, m; 0: never.",
+    )
     tight_clearance_m: float = Field(0.3, gt=0, le=2, description="Up to here the slowest speed, m.")
     free_clearance_m: float = Field(0.6, gt=0, le=5, description="From here on no slowing down, m.")
     comfort_clearance_m: float = Field(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from typing import Any
 
@@ -21,6 +22,13 @@ _KEPT = ("at", "end", "changed", "why", "trouble_ns", "backing_ns", "idle_ns")
 _TRAIL_M = 6.0
 _BACKING_S = 5.0
 """Backing off ends then at the latest."""
+_ON_SPOT_RAD = math.radians(40.0)
+"""From about so much on followers turn on the spot."""
+_MORE_ROOM_M = 0.05
+_REACTION_S = 0.2
+"""So long it goes on as it goes before it brakes."""
+_ROOM_WITHIN_M = 1.5
+"""The robot goes back before it turns if there is room so near on its trail."""
 _WAY_OUT_M = 0.6
 """Over this a robot in a tight place may have less clearance than paths keep."""
 
@@ -102,7 +110,14 @@ class Driven:
             points, begin, ground.state, ground.clearance_m, s.resolution_m, s.ix0, s.iy0, needed_m
         )
 
-    def follow(self, now: Stamp, odometry: Odometry, follower: FollowerState | None, plan_id: int) -> bool:
+    def follow(
+        self,
+        now: Stamp,
+        odometry: Odometry,
+        follower: FollowerState | None,
+        plan_id: int,
+        ground: Ground | None = None,
+    ) -> bool:
         """Where the robot is on its path. Returns whether the path was dropped: left, or no way on along it.
 
         plan_id: of the newest plan.
@@ -122,7 +137,9 @@ class Driven:
         if dropped:
             self.drop("off the path")
         else:
-            dropped = self._meet_trouble(now, odometry, follower, plan_id)
+            dropped = self._meet_trouble(now, odometry, follower, plan_id) or (
+                ground is not None and self._leave_tight_place(now, odometry, ground)
+            )
         if self.backing and (self.left_m() < STEP_M or now - self.backing_ns > _BACKING_S * SECOND_NS):
             self.drop("backed off")
             dropped = True
@@ -147,6 +164,33 @@ class Driven:
         self.drop("blocked")
         if not backing:
             self._back_off(now, odometry, self._config.back_off_m, "blocked: backs off")
+        return True
+
+    def _leave_tight_place(self, now: Stamp, odometry: Odometry, ground: Ground) -> bool:
+        """Before the path makes the robot turn on the spot where its feet would meet something, it goes back, in
+        reverse, to where it has room. Returns whether the path was dropped."""
+        assert self.committed is not None
+        pose, points = odometry.pose, self.committed.points
+        needed_m = self._config.footprint_radius_m + self._config.turn_room_m
+        if self.backing or self._config.turn_room_m == 0.0 or self.left_m() < STEP_M:
+            return False
+        here, v = np.array([pose.x_m, pose.y_m]), odometry.speed_mps
+        stop_m = v * _REACTION_S + v * abs(v) / (2.0 * self._config.max_acceleration_mps2)
+        stop = here + stop_m * np.array([math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)])
+        if min(self._clearance_m(ground, at) for at in (here, stop)) >= needed_m:
+            return False
+        soon = points[self.at : min(self.at + 3 + math.ceil(stop_m / STEP_M) + 2, self.end + 1)]
+        legs = soon[2:] - soon[:-2]
+        off = np.angle(np.exp(1j * (np.arctan2(legs[:, 1], legs[:, 0]) - pose.yaw_rad)))
+        if not (np.abs(off) > _ON_SPOT_RAD).any():
+            return False
+        back = resample(self._trail.back(pose.x_m, pose.y_m, _ROOM_WITHIN_M))
+        enough_m = needed_m + _MORE_ROOM_M
+        room = next((k for k, at in enumerate(back) if self._clearance_m(ground, at) >= enough_m), -1)
+        if room < 0:
+            return False
+        self.drop("tight")
+        self._back_off(now, odometry, max(room, 2) * STEP_M, "tight: goes back before it turns")
         return True
 
     def leave_if_idle(self, now: Stamp, odometry: Odometry, wanted: bool) -> None:

@@ -114,7 +114,7 @@ class ReconcilerStage:
         )
         found: Outputs = []
         follower = inputs.current(FOLLOWER)
-        if self._driven.follow(now, odometry.message, follower, self._plan_id):
+        if self._driven.follow(now, odometry.message, follower, self._plan_id, ground):
             self._opened = None
         for received in inputs.new(LOCAL_POLICY):
             self._install(now, received.message, odometry.message, ground)
