@@ -27,7 +27,7 @@ def configure_logs(service: str = "", level: int = logging.INFO) -> None:
             renderer,
         ],
         wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),  # whichever it is now
         cache_logger_on_first_use=False,
     )
     if service:
