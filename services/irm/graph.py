@@ -36,6 +36,7 @@ class RoadGraph:
         self._components = Components()
         self._of_keyframe: dict[int, list[int]] = {}
         self._changed: set[Key] = set()
+        self._new_ways: set[tuple[int, int]] = set()
         self._published: dict[Any, tuple[Any, ...]] = {}
 
     # --- nodes ------------------------------------------------------------------------------------------------
@@ -116,6 +117,7 @@ class RoadGraph:
         if a > b:  # the line turned round: 1 - t along it, and -s across
             way = [1.0 - v if i % 2 == 0 else -v for i, v in enumerate(way)]
         self.graph.edges[a, b]["way"] = way
+        self._new_ways.add((min(a, b), max(a, b)))
 
     def drop_edge(self, a: int, b: int) -> None:
         """Remove an edge."""
@@ -233,7 +235,9 @@ class RoadGraph:
 
     def difference(self, message: GlobalIrm) -> dict[str, Any]:
         """What a message that was just made tells, with all that the graph keeps of it: for the journal."""
-        edges = zip(message.edge_a.tolist(), message.edge_b.tolist(), strict=True)
+        told = zip(message.edge_a.tolist(), message.edge_b.tolist(), strict=True)
+        ways = {edge for edge in self._new_ways if self.graph.has_edge(*edge)}  # which no message tells
+        edges, self._new_ways = sorted({*told, *ways}), set()
         return {
             "whole": message.base_version == 0,
             "nodes": [[n, dict(self.graph.nodes[n])] for n in message.node_id.tolist()],
