@@ -88,6 +88,8 @@ class RuntimeConfig(_Section):
     snapshot_period_s: float = Field(5.0, gt=0, le=600)
     """Between two snapshots of a stage's state; longer of itself where snapshots are expensive. What is acknowledged is
     journaled in between; the rest (frames of the risk map, a plan) is at most so much older after a restart."""
+    recorder_snapshot_period_s: float = Field(30.0, gt=0, le=3600)
+    """Between two snapshots of a stage's state for a recorder that listens: a replay can begin at each."""
     stop_timeout_s: float = Field(3.0, gt=0)
     """Grace between SIGTERM and SIGKILL."""
 

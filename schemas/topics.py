@@ -8,6 +8,7 @@ from schemas.base import Message
 from schemas.contract import SECOND_NS, Topic
 from schemas.operation import JudgeReport, MissionCommand, MissionState, StageHealth, WorldPicture
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPolicy, Plan
+from schemas.recording import StageSnapshot, StepRecord
 from schemas.sensing import CoverageScan, FollowerState, Odometry, PointCloud, PoseGraph, ReadyGrid
 from schemas.world import (
     CoverageSummary,
@@ -162,6 +163,26 @@ def health_topic(service: str) -> Topic[StageHealth]:
     )  # fmt: skip
 
 
+def steps_topic(service: str) -> Topic[StepRecord]:
+    """Each step of a stage, for a recorder: written by its driver while a recorder listens."""
+    return _topic(
+        StepRecord, f"{service}/steps", "", f"the steps of {service}, for a recorder", period_ms=0, keep_all=True,
+    )  # fmt: skip
+
+
+def snapshot_topic(service: str) -> Topic[StageSnapshot]:
+    """The state of a stage, for a recorder: when one has come, and then now and then."""
+    return _topic(
+        StageSnapshot, f"{service}/snapshot", "", f"the state of {service}, for a recorder", period_ms=0,
+        max_bytes=256 * _MIB,
+    )  # fmt: skip
+
+
+def recorder_topics(service: str) -> list[Topic[Message]]:
+    """What a service's driver writes beside the stage's own topics and its health."""
+    return [steps_topic(service), snapshot_topic(service)]
+
+
 def read_by(service: str) -> list[Topic[Message]]:
     """The topics that a service reads, in the order of the table."""
     health = [health_topic(name) for name in SERVICES] if service == "status" else []
@@ -175,4 +196,5 @@ def written_by(service: str) -> list[Topic[Message]]:
 
 def topic_named(name: str) -> Topic[Message]:
     """The topic with this name; KeyError when there is none."""
-    return next(t for t in (*TOPICS, *(health_topic(s) for s in SERVICES)) if t.name == name)
+    drivers = (t for s in SERVICES for t in (health_topic(s), *recorder_topics(s)))
+    return next(t for t in (*TOPICS, *drivers) if t.name == name)

@@ -7,7 +7,6 @@ steps the stage, so that steps never overlap and signals are served between them
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 
 import zenoh
@@ -20,8 +19,9 @@ from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.mailbox import Mailbox, Outbox
 from plgrim.runtime.process import Interrupted, interruptible
 from plgrim.runtime.service import LiveService
+from plgrim.runtime.step_log import NotedStopwatch, StepLog, error_text
 from schemas.base import Message
-from schemas.contract import Inputs, Stage, StageSetup, StageSpec, Stamp, Topic
+from schemas.contract import Inputs, Output, Stage, StageSetup, StageSpec, Stamp, Topic
 from schemas.topics import read_by, written_by
 
 MakeStage = Callable[[], tuple[StageSpec, Stage]]
@@ -33,24 +33,28 @@ def run_stage(name: str, config: Config, stop: threading.Event) -> None:
     if options is None:
         raise ServiceFailedError(f"there is no module services.{name}.stage")
     module = stage_module(name)
+    stopwatch = NotedStopwatch()
+    steps = StepLog(
+        name, config.seed, options.model_dump_json(), stopwatch, config.runtime.recorder_snapshot_period_s
+    )
 
     def make() -> tuple[StageSpec, Stage]:
         if hasattr(module, "warm_up"):
             module.warm_up()
         with world_errors(name):
-            stage: Stage = module.create(
-                options, StageSetup(config.robot, config.seed, stopwatch=time.monotonic)
-            )
+            stage: Stage = module.create(options, StageSetup(config.robot, config.seed, stopwatch=stopwatch))
         return module.spec(options), stage
 
-    drive(name, config, make, stop)
+    drive(name, config, make, stop, steps)
 
 
-def drive(name: str, config: Config, make: MakeStage, stop: threading.Event) -> None:
+def drive(
+    name: str, config: Config, make: MakeStage, stop: threading.Event, steps: StepLog | None = None
+) -> None:
     """Run any stage under the name of a service until `stop` is set.
 
     Connects first, so that a second instance is refused before it compiles or loads anything. Raises PlgrimError, and
-    what `make` raises.
+    what `make` raises. steps: how the stage's steps are told to a recorder; without it they are not.
     """
     with LiveService(name, config, stop) as service:
         keeper = Keeper.of(config.runtime, config.robot, name)
@@ -59,7 +63,7 @@ def drive(name: str, config: Config, make: MakeStage, stop: threading.Event) -> 
                 spec, stage = _make(make, keeper, service.clock.now_ns())
         except Interrupted:
             return
-        LiveDriver(service, spec, stage, keeper).run(stop)
+        LiveDriver(service, spec, stage, keeper, steps).run(stop)
 
 
 def _make(make: MakeStage, keeper: Keeper | None, now: Stamp) -> tuple[StageSpec, Stage]:
@@ -81,7 +85,12 @@ class LiveDriver:
     """Steps a stage at its period and when a trigger arrives; publishes what it gives."""
 
     def __init__(
-        self, service: LiveService, spec: StageSpec, stage: Stage, keeper: Keeper | None = None
+        self,
+        service: LiveService,
+        spec: StageSpec,
+        stage: Stage,
+        keeper: Keeper | None = None,
+        steps: StepLog | None = None,
     ) -> None:
         config = service.config
         self._service = service
@@ -89,6 +98,7 @@ class LiveDriver:
         self._spec = spec
         self._stage = stage
         self._keeper = keeper
+        self._steps = steps or StepLog(service.name, config.seed, "{}", NotedStopwatch())
         self._mailbox = Mailbox(config.robot, tuple(read_by(service.name)))
         self._outbox = Outbox(config.robot, service.name, service.epoch)
         self._wake = threading.Condition()
@@ -101,6 +111,7 @@ class LiveDriver:
         """Subscribe, become ready, step until `stop`. Raises ServiceFailedError after too many errors in a row."""
         for topic in written_by(self._service.name):
             self._service.link.declare(topic)
+        self._steps.attach(self._service.link, self._outbox)
         for topic in self._mailbox.topics:
             self._service.link.subscribe(topic, self._accept)
         self._service.mailbox_report = self._mailbox_report
@@ -127,8 +138,11 @@ class LiveDriver:
 
     def _accept(self, topic: Topic[Message], payload: bytes) -> None:
         with self._wake:
-            accepted = self._mailbox.accept(topic, payload, self._clock.now_ns())
+            now = self._clock.now_ns()
+            accepted = self._mailbox.accept(topic, payload, now)
             refusal = "" if accepted else self._mailbox.last_refusal
+            if accepted:
+                self._steps.arrived(topic, self._mailbox, now)
             if accepted and topic.name in self._triggers:
                 self._triggered = True
                 self._wake.notify()
@@ -147,26 +161,34 @@ class LiveDriver:
             return triggered
 
     def _step(self, now: Stamp) -> None:
+        tell_state = self._steps.wanted()
         with self._wake:
+            mailbox_state = self._mailbox.state() if tell_state else {}
+            arrived = self._steps.begin(now)
             inputs = self._mailbox.inputs(now)
             # Before the step, not after it: what arrives meanwhile stays fresh, and queued, for the next one.
             self._mailbox.stepped()
+        if tell_state:
+            self._steps.snapshot(self._stage, mailbox_state)
         monitor = self._service.monitor
         monitor.step_began()
+        trouble = ""
         try:
             self._publish(inputs, now)
             if self._keeper is not None:
                 self._keeper.after_step(self._stage, now)
             self._errors_in_a_row = 0
         except Exception as error:
+            trouble = error_text(error)
             self._failed(error)
         finally:
             monitor.step_ended()
+            self._steps.end(arrived, trouble)
 
     def _publish(self, inputs: Inputs, now: Stamp) -> None:
         """Step, write down what is acknowledged, and only then say it."""
         found = self._stage.step(now, inputs)
-        payloads = [self._outbox.pack(output, self._clock.now_ns(), inputs.consumed) for output in found]
+        payloads = [self._pack(output, inputs) for output in found]
         if self._keeper is not None:
             self._keeper.before_publishing(self._stage, found)
         for output, payload in zip(found, payloads, strict=True):
@@ -175,6 +197,12 @@ class LiveDriver:
             except zenoh.ZError as error:
                 self._service.monitor.dropped[f"{output.topic.name}:not_sent"] += 1
                 self._log.warning("not sent", topic=output.topic.name, error=str(error)[:200])
+
+    def _pack(self, output: Output, inputs: Inputs) -> bytes:
+        sent_ns = self._clock.now_ns()
+        payload = self._outbox.pack(output, sent_ns, inputs.consumed)
+        self._steps.said(output, payload, sent_ns)
+        return payload
 
     def _failed(self, error: Exception) -> None:
         self._errors_in_a_row += 1

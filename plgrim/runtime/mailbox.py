@@ -89,6 +89,11 @@ class Mailbox:
             self.dropped[f"{topic.name}:queue_full"] += 1
         queue.append(held)
 
+    def newest(self, topic: Topic[Message]) -> tuple[int, int]:
+        """Epoch and sequence of the newest message that is held of a topic. KeyError without any."""
+        envelope = self._held[topic.name][-1].envelope
+        return envelope.epoch, envelope.sequence
+
     def inputs(self, now_ns: int) -> Inputs:
         """What a step may read. now_ns: the clock that `received_ns` was read from."""
         messages: dict[str, list[Received[Message]]] = {}

@@ -147,6 +147,10 @@ class Link:
         """Put bytes on a topic; the publisher is declared by the first message or by `declare`."""
         self.declare(topic).put(payload)
 
+    def has_readers(self, topic: Topic[Message]) -> bool:
+        """Whether somebody subscribes to a topic (only one that is neither latched nor kept whole can tell)."""
+        return bool(self.declare(topic).matching_status.matching)
+
     def declare(self, topic: Topic[Message]) -> Any:
         """The publisher of a topic. Congestion drops: a blocked reader must never block a writer."""
         publisher = self._publishers.get(topic.name)

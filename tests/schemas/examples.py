@@ -19,12 +19,13 @@ from pydantic.fields import FieldInfo
 
 from schemas.base import ColumnSpec, Message, columns_of
 from schemas.codec import Envelope, encode
-from schemas.topics import TOPICS, health_topic
+from schemas.topics import TOPICS, health_topic, recorder_topics
 
 GOLDEN = Path(__file__).parent / "golden"
 ENVELOPE = Envelope("husky1", "writer", 3, 7, 11_000_000_000, {"sim/odometry": (3, 41)})
 MESSAGES: list[type[Message]] = sorted(
-    {topic.message for topic in (*TOPICS, health_topic("gcp"))}, key=lambda message: message.schema_name
+    {topic.message for topic in (*TOPICS, health_topic("gcp"), *recorder_topics("gcp"))},
+    key=lambda message: message.schema_name,
 )
 
 _CANDIDATES: dict[type, tuple[Any, ...]] = {

@@ -7,7 +7,7 @@ import pytest
 
 from schemas.base import Message, columns_of
 from schemas.codec import decode
-from schemas.topics import TOPICS, health_topic
+from schemas.topics import TOPICS, health_topic, recorder_topics
 from tests.schemas.examples import ENVELOPE, GOLDEN, MESSAGES, encoded, example, golden_file
 
 by_name = pytest.mark.parametrize("message", MESSAGES, ids=lambda message: message.schema_name)
@@ -46,6 +46,6 @@ def test_no_golden_file_is_without_its_message() -> None:
 
 
 def test_every_topic_has_a_golden_message() -> None:
-    for topic in (*TOPICS, health_topic("lcp")):
+    for topic in (*TOPICS, health_topic("lcp"), *recorder_topics("lcp")):
         assert golden_file(topic.message).exists()
         assert len(golden_file(topic.message).read_bytes()) <= topic.max_bytes

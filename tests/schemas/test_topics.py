@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from schemas.topics import SERVICES, TOPICS, health_topic, read_by, topic_named, written_by
+from schemas.topics import SERVICES, TOPICS, health_topic, read_by, recorder_topics, topic_named, written_by
 from tests.schemas.examples import MESSAGES
 
-ALL = (*TOPICS, *(health_topic(service) for service in SERVICES))
+ALL = (*TOPICS, *(t for s in SERVICES for t in (health_topic(s), *recorder_topics(s))))
 
 
 def test_names_and_schema_names_are_unique() -> None:
