@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
@@ -80,6 +81,11 @@ class SegmentWriter:
         os.fsync(self._file.fileno())
         self._file.close()
 
+    def abandon(self) -> None:
+        """Close the file as it is, after an error."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+
 
 class Ring:
     """Segments in a folder, named by start and number; the oldest go when they are too many bytes together.
@@ -144,6 +150,8 @@ class Ring:
     def _fail(self, error: OSError) -> None:
         if not self.trouble:
             get_logger().error("nothing is recorded", reason=str(error), folder=str(self.folder))
+        if self._writer is not None:
+            self._writer.abandon()
         self.trouble, self._writer, self._retry_s = str(error), None, self._clock() + 5.0
 
     def _end(self) -> None:
@@ -154,6 +162,7 @@ class Ring:
             writer.close()
             writer.path.rename(writer.path.with_suffix(""))
         except OSError as error:
+            writer.abandon()
             self._fail(error)
 
     def _make_room(self) -> None:
