@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from planning.frames import Planar
+from plgrim.evaluation.events import EventLog
 from plgrim.evaluation.plan_changes import PlanChanges
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS, Stamp, Topic
@@ -89,6 +90,7 @@ class MissionRecorder:
         self._belief: list[tuple[float, float]] = []
         self._track: list[tuple[float, ...]] = []
         self._zero_ns: Stamp | None = None
+        self._events = EventLog()
 
     def observe(self, topic: Topic[Any], message: Message, now: Stamp, epoch: int = 0) -> None:
         """Take in a message. now: mission clock when it was sent, ns. epoch: which life of its writer."""
@@ -96,6 +98,7 @@ class MissionRecorder:
             self._observe(message, now, epoch)
 
     def _observe(self, message: Message, now: Stamp, epoch: int) -> None:
+        self._events.observe(message, now)
         match message:
             case JudgeReport():
                 self.judge = message
@@ -209,6 +212,9 @@ class MissionRecorder:
                 "plan_changes": self.changes.result(),
                 "stages": self._stages(step_seconds or {}),
                 "restarts": dict(self.restarts),
+                "coverage_by_belief": [[round(t, 1), round(share, 4)] for t, share in _thinned(self._belief)],
+                "events": list(self._events.events),
+                "events_dropped": self._events.dropped,
                 "versions": _versions(),
                 **dict(extra or {}),
             }
@@ -274,6 +280,12 @@ class MissionRecorder:
         if picture is not None:
             map_picture(out_dir / "map.png", picture, [(row[1], row[2]) for row in track], _title(result))
         return result
+
+
+def _thinned(series: list[tuple[float, float]], most: int = 500) -> list[tuple[float, float]]:
+    """At most about so many of a series, the last one always among them."""
+    every = max(1, -(-len(series) // most))
+    return [*series[::every], *series[-1:]] if every > 1 else series
 
 
 def _title(result: Mapping[str, Any]) -> str:

@@ -1,0 +1,89 @@
+"""What happened in a mission, in plain words: from the messages, for results and reports."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+from schemas.base import Message
+from schemas.contract import SECOND_NS, Stamp
+from schemas.operation import JudgeReport, MissionState, StageHealth
+from schemas.policy import GlobalPolicy, Plan, SafetyState
+from schemas.world import CoverageSummary
+
+_MOST = 2000
+_QUIET = frozenset({SafetyState.RUN, SafetyState.DONE, SafetyState.RETURN})
+
+
+@dataclass(slots=True)
+class EventLog:
+    """Collects events: {"t_s", "kind", "text"}, oldest first, at most 2000; `dropped` counts those beyond.
+
+    kind: mission, target, safety, given up, fault.
+    """
+
+    events: list[dict[str, Any]] = field(default_factory=list)
+    dropped: int = 0
+    _phase: str = ""
+    _target: int = -1
+    _safety: SafetyState = SafetyState.RUN
+    _errors: Counter[str] = field(default_factory=Counter)
+    _given_up: set[tuple[float, float, str]] = field(default_factory=set)
+    _lost: bool = False
+
+    def observe(self, message: Message, now: Stamp) -> None:
+        """Take in a message. now: mission clock, ns."""
+        match message:
+            case MissionState():
+                self._mission(message, now)
+            case GlobalPolicy():
+                self._policy(message, now)
+            case Plan():
+                self._plan(message, now)
+            case CoverageSummary():
+                self._coverage(message, now)
+            case StageHealth() if message.errors > self._errors[message.service]:
+                self._errors[message.service] = message.errors
+                self._add(now, "fault", f"{message.service}: {message.last_error}")
+            case JudgeReport() if message.lost and not self._lost:
+                self._lost = True
+                self._add(now, "fault", f"the robot is lost: {message.lost_reason}")
+
+    def _add(self, now: Stamp, kind: str, text: str) -> None:
+        if len(self.events) >= _MOST:
+            self.dropped += 1
+            return
+        self.events.append({"t_s": round(now / SECOND_NS, 1), "kind": kind, "text": text})
+
+    def _mission(self, m: MissionState, now: Stamp) -> None:
+        if m.phase.value != self._phase:
+            self._phase = m.phase.value
+            finish = f" ({m.finish.value})" if m.finish.value else ""
+            self._add(now, "mission", f"{m.phase.value}{finish}" + (f": {m.reason}" if m.reason else ""))
+
+    def _policy(self, m: GlobalPolicy, now: Stamp) -> None:
+        if m.target == self._target:
+            return
+        self._target = m.target
+        if m.target < 0:
+            self._add(now, "target", f"no target: {m.reason}")
+            return
+        numbers = f"{m.target_gain:.1f} nats expected, {m.target_distance_m:.0f} m, risk {m.target_risk:.2f}"
+        x, y, _ = m.target_xyz_m
+        why = "left the last target for" if m.switched else "chose"
+        self._add(now, "target", f"{why} frontier {m.target} at ({x:.1f}, {y:.1f}): {numbers}; {m.reason}")
+
+    def _plan(self, m: Plan, now: Stamp) -> None:
+        if m.safety is self._safety:
+            return
+        before, self._safety = self._safety, m.safety
+        if m.safety not in _QUIET or before not in _QUIET:
+            self._add(now, "safety", f"{m.safety.value}: {m.reason}")
+
+    def _coverage(self, m: CoverageSummary, now: Stamp) -> None:
+        places = zip(m.unreachable_xy_m.tolist(), m.unreachable_reason, strict=False)
+        listed = {(round(x, 1), round(y, 1), reason) for (x, y), reason in places}
+        for x, y, reason in sorted(listed - self._given_up):
+            self._add(now, "given up", f"frontier at ({x:.1f}, {y:.1f}) given up: {reason}")
+        self._given_up = listed
