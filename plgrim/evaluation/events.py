@@ -20,7 +20,7 @@ _QUIET = frozenset({SafetyState.RUN, SafetyState.DONE, SafetyState.RETURN})
 class EventLog:
     """Collects events: {"t_s", "kind", "text"}, oldest first, at most 2000; `dropped` counts those beyond.
 
-    kind: mission, target, safety, given up, fault.
+    t_s: mission clock, s. kind: mission, target, safety, given up, fault.
     """
 
     events: list[dict[str, Any]] = field(default_factory=list)
@@ -50,6 +50,10 @@ class EventLog:
                 self._lost = True
                 self._add(now, "fault", f"the robot is lost: {message.lost_reason}")
 
+    def since(self, zero_ns: Stamp) -> list[dict[str, Any]]:
+        """The events with times since `zero_ns`; what came before it has a negative one."""
+        return [{**event, "t_s": round(event["t_s"] - zero_ns / SECOND_NS, 1)} for event in self.events]
+
     def _add(self, now: Stamp, kind: str, text: str) -> None:
         if len(self.events) >= _MOST:
             self.dropped += 1
@@ -69,10 +73,10 @@ class EventLog:
         if m.target < 0:
             self._add(now, "target", f"no target: {m.reason}")
             return
-        numbers = f"{m.target_gain:.1f} nats expected, {m.target_distance_m:.0f} m, risk {m.target_risk:.2f}"
         x, y, _ = m.target_xyz_m
         why = "left the last target for" if m.switched else "chose"
-        self._add(now, "target", f"{why} frontier {m.target} at ({x:.1f}, {y:.1f}): {numbers}; {m.reason}")
+        said = m.reason.removeprefix(f"frontier {m.target}: ")
+        self._add(now, "target", f"{why} frontier {m.target} at ({x:.1f}, {y:.1f}): {said}")
 
     def _plan(self, m: Plan, now: Stamp) -> None:
         if m.safety is self._safety:

@@ -213,7 +213,7 @@ class MissionRecorder:
                 "stages": self._stages(step_seconds or {}),
                 "restarts": dict(self.restarts),
                 "coverage_by_belief": [[round(t, 1), round(share, 4)] for t, share in _thinned(self._belief)],
-                "events": list(self._events.events),
+                "events": self._events.since(self._zero_ns or 0),
                 "events_dropped": self._events.dropped,
                 "versions": _versions(),
                 **dict(extra or {}),

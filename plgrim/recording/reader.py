@@ -29,9 +29,14 @@ def read_raw(path: Path, warn: Warn, wanted: Callable[[str], bool] = lambda topi
         )
     found = False
     for file in files:
-        for raw in _read_file(file, warn, wanted):
-            found = True
-            yield raw
+        try:
+            for raw in _read_file(file, warn, wanted):
+                found = True
+                yield raw
+        except RecordingError as error:  # one segment of many
+            if not path.is_dir():
+                raise
+            warn(str(error))
     if not found:
         raise RecordingError(
             f"{path}: holds no PLGRIM messages (topics {RAW_PREFIX}...): `plgrim record` writes them; "

@@ -126,18 +126,21 @@ def _recording(path: Path) -> Mission:
     from plgrim.evaluation.recorder import RECORDED, MissionRecorder
     from plgrim.recording.reader import read_about, read_raw
     from schemas.codec import decode
+    from schemas.recording import StageSnapshot
     from schemas.topics import topic_named
 
     about = read_about(path)
     wanted = {topic.name for topic in RECORDED}
-    recorder = MissionRecorder(int(about.get("seed", 0)), about.get("world", "-"), "recording")
+    recorder = MissionRecorder(0, about.get("world", "-"), "recording")
     warnings: list[str] = []
     options: dict[str, Any] = {}
+    seed = int(about.get("seed", 0))
     for raw in read_raw(path, warnings.append, lambda name: name in wanted or name.endswith("/snapshot")):
         topic = topic_named(raw.topic)
         message, envelope = decode(raw.payload, topic.message, topic.max_bytes)
         if raw.topic.endswith("/snapshot"):
-            options[raw.writer] = json.loads(message.options)  # type: ignore[attr-defined]
+            assert isinstance(message, StageSnapshot)
+            options[raw.writer], seed = json.loads(message.options), message.seed
             continue
         recorder.observe(topic, message, envelope.sent_ns, envelope.epoch)
     with tempfile.TemporaryDirectory() as folder:
@@ -147,7 +150,7 @@ def _recording(path: Path) -> Mission:
         import yaml
 
         mission.parameters = yaml.safe_dump(options, sort_keys=True)
-    mission.result["warnings"] = warnings
+    mission.result.update(warnings=warnings, seed=seed)
     return mission
 
 

@@ -12,8 +12,8 @@ from plgrim.report.gather import Campaign, Mission, facts, gather
 
 _STAGE_COLUMNS = ("steps", "step_p50_ms", "step_p99_ms", "rate_hz", "memory_mb", "errors", "dropped")
 _EMPTY: dict[str, Any] = {
-    "subtitle": "", "warnings": [], "facts": [], "succeeded": False, "pictures": [], "curves": [], "events": [],
-    "kinds": [], "events_dropped": 0, "left": [], "stages": {}, "stage_columns": _STAGE_COLUMNS, "rows": [],
+    "subtitle": "", "warnings": [], "facts": [], "succeeded": False, "pictures": [], "pictures_title": "Map", "curves": [],
+    "events": [], "kinds": [], "events_dropped": 0, "left": [], "stages": {}, "stage_columns": _STAGE_COLUMNS, "rows": [],
     "columns": [], "runs": [], "left_out": 0, "summary": "", "parameters": "", "versions": {},
 }  # fmt: skip
 
@@ -59,6 +59,7 @@ def _of_campaign(campaign: Campaign) -> dict[str, Any]:
         "title": f"PLGRIM campaign: {campaign.name}",
         "subtitle": f"{len(campaign.rows)} runs",
         "pictures": campaign.pictures,
+        "pictures_title": "Coverage",
         "rows": campaign.rows,
         "columns": campaign.columns,
         "runs": campaign.runs,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from plgrim.recording.errors import RecordingError
 from plgrim.recording.reader import read_about, read_raw
 from plgrim.recording.writer import Ring, segments
 from schemas.codec import decode
-from schemas.topics import ODOMETRY
+from schemas.sensing import Odometry
 from tests.recording.conftest import Short
 
 
@@ -49,18 +50,15 @@ def test_the_mcap_library_decodes_every_channel(short: Short) -> None:
 def test_rosbags_decodes_every_channel_and_sees_the_same_numbers(short: Short) -> None:
     (path,) = segments(short.folder)
     seen: dict[str, int] = {}
-    odometry = []
+    odometry: list[float] = []
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         for connection, _, data in reader.messages():
-            message = reader.deserialize(data, connection.msgtype)
+            message: Any = reader.deserialize(data, connection.msgtype)
             seen[connection.topic] = seen.get(connection.topic, 0) + 1
             if connection.topic == "/plgrim/odometry":
                 odometry.append(message.pose.pose.position.x)
         assert set(seen) == {connection.topic for connection in reader.connections}
-    topic = ODOMETRY
-    ours = [
-        decode(r.payload, ODOMETRY.message, topic.max_bytes)[0] for r in short.raws if r.topic == topic.name
-    ]
+    ours = [decode(r.payload, Odometry, 1 << 20)[0] for r in short.raws if r.schema == "odometry"]
     assert odometry == [message.pose.x_m for message in ours]
     assert seen["/plgrim/cloud"] < seen["/plgrim/raw/sim/cloud"]
 
