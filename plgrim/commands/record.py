@@ -91,6 +91,8 @@ def _print(report: Any) -> None:
         print(f"{name}: {report.steps[name]} steps, {report.outputs[name]} outputs compared")
     for reason, count in sorted(report.gaps.items()):
         print(f"not stepped: {reason} ({count})")
+    for reason, count in sorted(report.before.items()):
+        print(f"not recorded whole: {reason} ({count})")
     differences = sorted(report.differences, key=lambda d: d.now_ns)
     if differences:
         print(f"first output that differs: {differences[0]}")

@@ -35,6 +35,7 @@ Key = tuple[str, int, int]
 @dataclass(slots=True)
 class ReplayReport:
     """What a replay found. steps, outputs: done again and compared, by stage. gaps: what could not be, and why.
+    before: steps from before the first snapshot, when the recorder had only just come.
 
     differences: the first of each stage's life. began_ns, ended_ns: mission clock of the first and last step.
     """
@@ -42,6 +43,7 @@ class ReplayReport:
     steps: Counter[str] = field(default_factory=Counter)
     outputs: Counter[str] = field(default_factory=Counter)
     gaps: Counter[str] = field(default_factory=Counter)
+    before: Counter[str] = field(default_factory=Counter)
     differences: list[Difference] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     began_ns: int = 0
@@ -60,6 +62,7 @@ class ReplayReport:
             "steps": dict(self.steps),
             "outputs": dict(self.outputs),
             "gaps": dict(self.gaps),
+            "before": dict(self.before),
             "differences": [d.summary() for d in self.differences],
             "warnings": self.warnings,
             "mission_s": (self.ended_ns - self.began_ns) / SECOND_NS,
@@ -107,7 +110,8 @@ class Replay:
     _report: ReplayReport = field(default_factory=ReplayReport)
     _shelf: _Shelf = field(default_factory=_Shelf)
     _lives: dict[tuple[str, int], Life] = field(default_factory=dict)
-    _snapshots: dict[tuple[str, int], deque[tuple[StageSnapshot, str]]] = field(default_factory=dict)
+    _snapshots: dict[tuple[str, int], dict[int, tuple[StageSnapshot, str]]] = field(default_factory=dict)
+    _begun: set[tuple[str, int]] = field(default_factory=set)
     _steps: deque[tuple[int, int, StepRecord]] = field(default_factory=deque)
     _began_s: float = 0.0
 
@@ -126,7 +130,7 @@ class Replay:
         while self._steps and not stop():
             self._step(*self._steps.popleft()[1:])
         report.wall_s = time.monotonic() - began
-        if not report.steps and not report.gaps:
+        if not report.steps and not report.gaps and not report.before:
             report.gaps["no steps are recorded of " + ", ".join(sorted(self.stages))] += 1
         return report
 
@@ -175,6 +179,9 @@ class Replay:
     def _life(self, key: tuple[str, int], record: StepRecord) -> Life | None:
         """The stage that this step is the next one of; None when it cannot be stepped."""
         life = self._lives.get(key)
+        self._snapshots.get(key, {}).pop(
+            record.step if life is not None and life.next_step == record.step else -1, None
+        )
         if life is not None and life.over:
             return None
         if life is not None and record.step != life.next_step:
@@ -188,18 +195,22 @@ class Replay:
         return life
 
     def _begin(self, key: tuple[str, int], record: StepRecord) -> Life | None:
-        for snapshot, robot in self._snapshots.get(key, ()):
-            if snapshot.step == record.step:
-                try:
-                    life = Life(key, robot, snapshot, self.overrides.get(key[0], {}))
-                except PlgrimError as error:
-                    self._report.gaps[f"{key[0]}: cannot be made: {error}"] += 1
-                    return None
-                self._lives[key] = life
-                return life
-        if key in self._snapshots or record.step > 1:
-            self._report.gaps[f"{key[0]}: steps before a snapshot"] += 1
-        return None
+        held = self._snapshots.get(key, {})
+        for step in [step for step in held if step < record.step]:
+            del held[step]
+        if record.step not in held:
+            into = self._report.gaps if key in self._begun else self._report.before
+            into[f"{key[0]}: steps before a snapshot"] += 1
+            return None
+        snapshot, robot = held.pop(record.step)
+        self._begun.add(key)
+        try:
+            life = Life(key, robot, snapshot, self.overrides.get(key[0], {}))
+        except PlgrimError as error:
+            self._report.gaps[f"{key[0]}: cannot be made: {error}"] += 1
+            return None
+        self._lives[key] = life
+        return life
 
     def _pace(self, now: int) -> None:
         if not self.speed:

@@ -12,9 +12,10 @@ from plgrim.report.gather import Campaign, Mission, facts, gather
 
 _STAGE_COLUMNS = ("steps", "step_p50_ms", "step_p99_ms", "rate_hz", "memory_mb", "errors", "dropped")
 _EMPTY: dict[str, Any] = {
-    "subtitle": "", "warnings": [], "facts": [], "succeeded": False, "pictures": [], "pictures_title": "Map", "curves": [],
-    "events": [], "kinds": [], "events_dropped": 0, "left": [], "stages": {}, "stage_columns": _STAGE_COLUMNS, "rows": [],
-    "columns": [], "runs": [], "left_out": 0, "summary": "", "parameters": "", "versions": {},
+    "subtitle": "", "warnings": [], "facts": [], "succeeded": False, "pictures": [], "pictures_title": "Map",
+    "curves": [], "events": [], "kinds": [], "events_dropped": 0, "left": [], "stages": {},
+    "stage_columns": _STAGE_COLUMNS, "rows": [], "columns": [], "runs": [], "left_out": 0, "summary": "",
+    "parameters": "", "versions": {},
 }  # fmt: skip
 
 

@@ -89,7 +89,7 @@ class Mailbox:
             self.dropped[f"{topic.name}:queue_full"] += 1
         queue.append(held)
 
-    def newest(self, topic: Topic[Message]) -> tuple[int, int]:
+    def newest_of(self, topic: Topic[Message]) -> tuple[int, int]:
         """Epoch and sequence of the newest message that is held of a topic. KeyError without any."""
         envelope = self._held[topic.name][-1].envelope
         return envelope.epoch, envelope.sequence

@@ -99,7 +99,7 @@ class StepLog:
     def arrived(self, topic: Topic[Message], mailbox: Mailbox, now: Stamp) -> None:
         """The mailbox has accepted a message of this topic."""
         if self._listening and len(self._arrived) < _LONGEST_BACKLOG:
-            self._arrived.append(_Arrival(topic.name, *mailbox.newest(topic), now))
+            self._arrived.append(_Arrival(topic.name, *mailbox.newest_of(topic), now))
 
     def wanted(self) -> bool:
         """Whether a snapshot is wanted before this step: a recorder has come, or the last one is old."""

@@ -104,12 +104,12 @@ def recorded(
     with connect(config.router, "robot", threading.Event(), 20.0) as own:
         recorder = Recorder(own, Ring(tmp_path / "r", {}))
         recorder.start()
-        eventually(lambda: recorder.counts["mission/snapshot"] >= 2, "two snapshots came", feed)
-        eventually(lambda: recorder.counts["mission/steps"] >= 40, "steps came", feed)
+        eventually(lambda: recorder.counts["mission/snapshot"] >= 3, "snapshots came", feed, 90.0)
+        eventually(lambda: recorder.counts["mission/steps"] >= 25, "steps came", feed, 90.0)
     recorder.close()
     stop.set()
     thread.join()
-    assert not recorder.lost
+    assert not recorder.lost, "this machine is too busy for the test"
     return tmp_path / "r"
 
 
