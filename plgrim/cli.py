@@ -6,18 +6,19 @@ import sys
 
 import typer
 
-from plgrim.commands import evaluate, feed, inspect, missions, record, report, services
+from plgrim.commands import doctor, evaluate, feed, inspect, missions, record, report, services
+from plgrim.commands.examples import add_examples
 from plgrim.errors import PlgrimError
 
 application = typer.Typer(
     name="plgrim",
     help="Autonomous exploration of unknown environments: a mission, its services, and how they are.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_show_locals=False,
 )
-for room in (missions, services, record, report, feed, evaluate, inspect):
+for room in (missions, services, doctor, record, report, feed, evaluate, inspect):
     room.register(application)
+add_examples(application)
 
 
 def app() -> None:
@@ -27,3 +28,9 @@ def app() -> None:
     except PlgrimError as error:
         print(f"plgrim: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
+    except (FileExistsError, NotADirectoryError, PermissionError) as error:
+        if error.filename is None:
+            raise
+        mend = "it must be a folder that can be written: name another with --out"
+        print(f"plgrim: {error.filename}: {error.strerror}: {mend}", file=sys.stderr)
+        sys.exit(2)

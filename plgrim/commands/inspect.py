@@ -27,6 +27,8 @@ def status(
     from plgrim.errors import PlgrimError
     from plgrim.missions import status_page
 
+    if url is not None and not url.startswith(("http://", "https://")):
+        raise typer.BadParameter(f"--url: {url!r} is no address: give one as http://127.0.0.1:8080")
     address = (url or status_page(load_config(config_file))).rstrip("/")
     try:
         answer = json.dumps(_get(f"{address}/api/v1/status"), indent=2)
@@ -57,7 +59,10 @@ def healthcheck(
 ) -> None:
     """Ask a running service end to end whether it makes progress; exit 0 when it does."""
     from plgrim.config import load_config
+    from schemas.topics import SERVICES
 
+    if service not in (*SERVICES, "router"):
+        raise typer.BadParameter(f"no service {service!r}; there are {', '.join((*SERVICES, 'router'))}")
     config = load_config(config_file)
     try:
         reason = _status_trouble(config) if service == "status" else _trouble(config, service, timeout)

@@ -26,10 +26,7 @@ def record(
     ] = False,
     config_file: ConfigFile = None,
 ) -> None:
-    """Record a running system as MCAP until Ctrl-C.
-
-    Example: plgrim record --out out/recording --max-mb 2000
-    """
+    """Record a running system as MCAP until Ctrl-C."""
     from plgrim.config import load_config
     from plgrim.logs import configure_logs
     from plgrim.recording.session import run_recorder
@@ -56,10 +53,7 @@ def replay(
         Path | None, typer.Option("--config", "-c", help="Its sections of stages replace the recorded ones.")
     ] = None,
 ) -> None:
-    """Step the recorded stages again; exit 0 when every output is the same, 1 with the first that differs.
-
-    Example: plgrim replay out/recording --stages lcp,reconciler
-    """
+    """Step the recorded stages again; exit 0 when every output is the same, 1 with the first that differs."""
     from plgrim.config import load_config
     from plgrim.logs import configure_logs
     from plgrim.recording.replay import Replay

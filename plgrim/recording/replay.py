@@ -147,9 +147,8 @@ class Replay:
         elif noun == "snapshot":
             held = snapshot_topic(service)
             snapshot, envelope = decode(raw.payload, held.message, held.max_bytes)
-            self._snapshots.setdefault((service, raw.epoch), deque(maxlen=3)).append(
-                (snapshot, envelope.robot)
-            )
+            waiting = self._snapshots.setdefault((service, raw.epoch), {})
+            waiting[snapshot.step] = snapshot, envelope.robot
         else:
             self._shelf.put(raw)
 

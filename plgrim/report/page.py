@@ -8,7 +8,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from plgrim.report.draw import mission_curves
-from plgrim.report.gather import Campaign, Mission, facts, gather
+from plgrim.report.gather import Campaign, Mission, ReportError, facts, gather
 
 _STAGE_COLUMNS = ("steps", "step_p50_ms", "step_p99_ms", "rate_hz", "memory_mb", "errors", "dropped")
 _EMPTY: dict[str, Any] = {
@@ -78,4 +78,26 @@ def write_report(path: Path, out: Path | None = None) -> Path:
     out = out or (path / "report.html" if path.is_dir() else path.with_suffix(".html"))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
+    return out
+
+
+def write_animation(path: Path, out: Path, every_s: float) -> Path:
+    """Write the animation of a recording; gives its path. Raises ReportError, RecordingError."""
+    from plgrim.recording.reader import read_raw
+    from plgrim.report.frames import SHOWN, FrameMaker
+    from schemas.codec import decode
+    from schemas.topics import topic_named
+
+    if out.suffix not in (".png", ".gif"):
+        raise ReportError(f"--animate {out}: a name that ends with .png (animated PNG) or .gif is wanted")
+    if path.is_dir() and (path / "result.json").exists():
+        raise ReportError(f"{path}: an animation needs a recording: run the mission beside `plgrim record`")
+    maker = FrameMaker(every_s=every_s)
+    for raw in read_raw(path, lambda _: None, SHOWN.__contains__):
+        topic = topic_named(raw.topic)
+        maker.observe(decode(raw.payload, topic.message, topic.max_bytes)[0], raw.sent_ns)
+    try:
+        maker.save(out)
+    except ValueError as error:
+        raise ReportError(f"{path}: {error}") from error
     return out

@@ -1,0 +1,1 @@
+"""`plgrim doctor`: findings about this machine and a running system, each with what mends it."""
