@@ -7,6 +7,7 @@
 #   make worlds      missions through the nine regression worlds, one for each complaint
 #   make bench       the short form of every bench: figures printed, minutes; BENCHES="qmdp lcp-speed" for some
 #   make faults      kill -9 of every service, five times each, in missions that go on; minutes, figures printed
+#   make pictures    the README's pictures and animations: missions in lock-step, minutes; PICTURES="cave" for some
 #   make lint        ruff, mypy, import-linter         make format      let ruff rewrite the files
 #   make check       env, lint and test in a clean copy of the tree: what CI runs
 #   make lock        resolve the locks anew            make clean       remove what was made here
@@ -34,7 +35,7 @@ export UV_LINK_MODE ?= copy
 # Third-party maps and recordings, which the tests that need them skip visibly without.
 export PLGRIM_DATA_DIR ?= $(abspath ../shared/data)
 
-.PHONY: help venv env demo test test-slow worlds bench faults lint format check lock clean
+.PHONY: help venv env demo test test-slow worlds bench faults pictures lint format check lock clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -80,6 +81,10 @@ bench: env
 FAULTS_ARGS ?=
 faults: env
 	@$(BIN)/python -m tests.faults.kill $(FAULTS_ARGS)
+
+PICTURES ?=
+pictures: env
+	@$(BIN)/python -m plgrim.report.pictures $(PICTURES)
 
 lint: venv
 	@echo "lint: ruff check"; $(BIN)/ruff check $(SOURCES)

@@ -24,6 +24,9 @@ def record(
         bool,
         typer.Option("--raw-only", help="Without the ROS 2 channels: half the size, replays all the same."),
     ] = False,
+    base: Annotated[
+        str, typer.Option(metavar="ENDPOINT", help="Base station's router, to offer the segments there.")
+    ] = "",
     config_file: ConfigFile = None,
 ) -> None:
     """Record a running system as MCAP until Ctrl-C."""
@@ -36,10 +39,33 @@ def record(
     configure_logs("record")
     config = load_config(config_file)
     with stop_on_signals() as stop:
-        counts, lost = run_recorder(config, out, stop, segment, int(max_mb * 1e6), raw_only)
+        counts, lost = run_recorder(config, out, stop, segment, int(max_mb * 1e6), raw_only, base)
     print(f"recorded {sum(counts.values())} messages of {len(counts)} topics in {out}/")
     for reason, count in sorted(lost.items()):
         print(f"lost: {count} {reason}")
+
+
+def fetch(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the segments.")] = Path(
+        "out/from_robot"
+    ),
+    rate: Annotated[float, typer.Option(min=1, help="At most so many kB/s of the link.")] = 100.0,
+    once: Annotated[bool, typer.Option("--once", help="End when all is there.")] = False,
+    config_file: ConfigFile = None,
+) -> None:
+    """Fetch a robot's recorded segments, over a link that may drop, until Ctrl-C."""
+    from plgrim.config import load_config
+    from plgrim.logs import configure_logs
+    from plgrim.recording.session import run_fetch
+    from plgrim.runtime.process import stop_on_signals
+
+    configure_logs("fetch")
+    config = load_config(config_file)
+    with stop_on_signals() as stop:
+        fetched, missing = run_fetch(config, out, stop, rate, once)
+    left = "no recorder answers" if missing < 0 else f"{missing} still missing"
+    print(f"fetched {fetched} segments into {out}/, {left}")
+    sys.exit(0 if missing == 0 else 1)
 
 
 def replay(
@@ -99,4 +125,5 @@ def _print(report: Any) -> None:
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.command()(record)
+    app.command()(fetch)
     app.command()(replay)
