@@ -7,8 +7,8 @@ from collections import Counter
 from pathlib import Path
 
 from plgrim.config import Config
-from plgrim.logs import get_logger
 from plgrim.errors import NoRouterError
+from plgrim.logs import get_logger
 from plgrim.missions import world_name
 from plgrim.recording.recorder import Recorder
 from plgrim.recording.transfer import Fetcher, Offer

@@ -31,7 +31,7 @@ def segments_key(robot: str) -> str:
 
 @dataclass(slots=True)
 class Offer:
-    """Answers on a session for a folder of segments. Several sessions (this host's router, the base's) may offer one."""
+    """Answers for a folder of segments, on one session or several (of this host's router, of the base's)."""
 
     folder: Path
     _checksums: dict[tuple[str, int], str] = field(default_factory=dict)
@@ -101,7 +101,7 @@ class Fetcher:
     damaged: int = 0
 
     def round(self, stop: threading.Event) -> int:
-        """Fetch what is missing until all is there, the link is gone or `stop`; segments still missing, -1: no answer."""
+        """Fetch until all is there, the link is gone or `stop`; how many are still missing, -1: no answer."""
         offered = self._ask("")
         if offered is None:
             return -1
