@@ -51,10 +51,8 @@ class Offer:
             except zenoh.ZError:  # the session has ended
                 return
             try:
-                query.reply(
-                    query.key_expr,
-                    self.answer({str(k): str(v) for k, v in query.parameters.to_dict().items()}),
-                )
+                asked = {name: str(query.parameters.get(name) or "") for name in ("name", "offset")}
+                query.reply(query.key_expr, self.answer(asked))
             except (OSError, ValueError, zenoh.ZError) as error:
                 get_logger().warning("segment not given", error=str(error)[:200])
             del query  # finished when it is dropped
@@ -72,7 +70,7 @@ class Offer:
         if name not in whole:
             raise ValueError(f"no segment {name!r}")
         with whole[name].open("rb") as file:
-            file.seek(max(0, int(parameters.get("offset", "0"))))
+            file.seek(max(0, int(parameters.get("offset") or 0)))
             return file.read(_PIECE_BYTES)
 
     def _checksum(self, path: Path) -> str:

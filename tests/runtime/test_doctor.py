@@ -72,12 +72,12 @@ def test_a_taken_port_is_named_with_the_key_that_mends_it(link: Link, config: Co
 def test_a_full_or_locked_disk_and_a_cold_cache_are_named(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(machine.shutil, "disk_usage", lambda _: type("U", (), {"free": 1e6})())
+    monkeypatch.setattr("shutil.disk_usage", lambda _: type("U", (), {"free": 1e6})())
     assert machine.disk(config).level == "error"
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "empty"))
     found = machine.kernels()
     assert (found.level, "plgrim.warmup" in found.mend) == ("warning", True)
-    monkeypatch.setattr(machine.time, "time", lambda: 3600.0)
+    monkeypatch.setattr("time.time", lambda: 3600.0)
     assert machine.clock(config).level == "error"
 
 
