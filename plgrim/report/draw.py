@@ -56,7 +56,7 @@ def mission_curves(track: dict[str, list[float]], result: dict[str, Any]) -> lis
     seconds = np.asarray(t)
     passed = np.maximum(np.diff(seconds), 1e-3)
     speed = np.diff(np.asarray(track["distance_m"])) / passed
-    width = max(1, round(5.0 / float(np.median(passed))))
+    width = min(len(speed), max(1, round(5.0 / float(np.median(passed)))))
     smooth = np.convolve(speed, np.ones(width) / width, mode="same")
     error = np.hypot(
         np.asarray(track["x_m"]) - np.asarray(track["true_x_m"]),
