@@ -42,6 +42,17 @@ _SCALE = 2
 """Drawn so many times larger and made smaller at the end: smooth lines."""
 
 
+def with_few_colours(image: Image.Image) -> Image.Image:
+    """The picture in the drawing's colours and their mixtures: a palette of the largest areas would lose the lines."""
+    grounds = (_UNKNOWN, _GROUND, _SEEN, _WORLD_GHOST, _WORLD_ROCK, _SOLID, _FAR)
+    lines = (_PATH, _EDGE, _CRUMB, _EDGE_OF, _TARGET, _PLAN, _INK)
+    mixed = [tuple((a + b) // 2 for a, b in zip(g, c, strict=True)) for g in grounds[:5] for c in lines]
+    mixed += [tuple((a + b) // 2 for a, b in zip(_SOLID, g, strict=True)) for g in grounds]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([value for colour in (*grounds, *lines, *mixed) for value in colour])
+    return image.convert("RGB").quantize(palette=palette, dither=Image.Dither.NONE)
+
+
 @dataclass(slots=True)
 class _Canvas:
     """Pixels over the world. left_m, top_m: its upper left corner in `map`; px_per_m: of the final picture."""
@@ -202,14 +213,13 @@ class FrameMaker:
         pen.rectangle([6, 6, 14 + pen.textlength(text, font_size=15), 28], fill=(255, 255, 255))
         pen.text((10, 8), text, fill=_INK, font_size=15)
 
-    def save(self, path: Path, frame_ms: int = 120, most_frames: int = 120, colours: int = 32) -> int:
+    def save(self, path: Path, frame_ms: int = 120, most_frames: int = 120) -> int:
         """Write an animated PNG (.png) or GIF (.gif); its size in bytes. ValueError when there is no frame."""
         if not self.frames:
             raise ValueError("no frame: the recording holds no world picture, or nothing was driven")
         every = max(1, -(-len(self.frames) // most_frames))
         chosen = [*self.frames[:-1:every], self.frames[-1]]
-        palette = chosen[-1].quantize(colours, method=Image.Quantize.MEDIANCUT)
-        few = [frame.quantize(colours, palette=palette, dither=Image.Dither.NONE) for frame in chosen]
+        few = [with_few_colours(frame) for frame in chosen]
         times = [frame_ms] * (len(few) - 1) + [2500]
         path.parent.mkdir(parents=True, exist_ok=True)
         options: dict[str, Any] = {"optimize": True} if path.suffix == ".gif" else {"default_image": False}

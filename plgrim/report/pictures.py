@@ -8,7 +8,7 @@ from typing import Any
 
 from plgrim.config import Config, load_config
 from plgrim.registry import STAGES
-from plgrim.report.frames import FrameMaker
+from plgrim.report.frames import FrameMaker, with_few_colours
 from plgrim.runtime.lockstep import Lockstep
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Stamp, Topic
@@ -46,7 +46,7 @@ def make(name: str, out: Path, limit_s: float | None = None) -> list[Path]:
     drive(load_config(None, overrides), maker, limit_s or longest_s)
     still, moving = out / f"{name}.png", out / f"{name}_mission.png"
     out.mkdir(parents=True, exist_ok=True)
-    maker.frames[-1].quantize(64).save(still, optimize=True)
+    with_few_colours(maker.frames[-1]).save(still, optimize=True)
     size = maker.save(moving)
     print(f"{still}, {moving}: {len(maker.frames)} frames, {size / 1e6:.2f} MB", flush=True)
     return [still, moving]
