@@ -1,4 +1,4 @@
-"""A robot and a base station in small, as processes: `python -m tests.link.fakes NAME` runs one over Zenoh.
+"""A robot and a base station in small: `python -m tests.link.fakes NAME ...` runs some of it over Zenoh.
 
 `sim`, `irm` and `mission` say something at their periods; `gcp` answers as the real one does: from the newest odometry
 and graph, and asks for the whole graph when a difference was missed.
@@ -6,24 +6,41 @@ and graph, and asks for the whole graph when a difference was missed.
 
 from __future__ import annotations
 
+import json
 import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from planning.graph_mirror import GraphMirror
-from plgrim.config import load_config
+from plgrim.config import Config, load_config
 from plgrim.errors import PlgrimError
 from plgrim.logs import configure_logs
 from plgrim.runtime.live import drive
 from plgrim.runtime.process import die_with_parent, stop_on_signals
-from schemas.base import Pose
-from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSpec, Stamp
-from schemas.operation import FinishReason
+from plgrim.runtime.zenoh_session import connect
+from schemas.base import Message, Pose
+from schemas.codec import decode
+from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSpec, Stamp, Topic
+from schemas.operation import CommandKind, FinishReason, LinkReport, MissionCommand
 from schemas.policy import GlobalPolicy
-from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION, ODOMETRY, STATUS_GRAPH_REQUEST
-from schemas.world import GlobalIrm, GraphRequest
+from schemas.topics import (
+    COMMAND,
+    GCP_GRAPH_REQUEST,
+    GLOBAL_IRM,
+    GLOBAL_POLICY,
+    MISSION,
+    ODOMETRY,
+    RISK_MAP,
+    STATUS_GRAPH_REQUEST,
+    topic_named,
+)
+from schemas.world import GlobalIrm, GraphRequest, GridHeader, RiskMap
 from tests.runtime.fake_services import mission_state, odometry
 
+MAP_CELLS = 126
 NODES_A_STEP = 5
 
 
@@ -122,53 +139,127 @@ class Mission(_Memoryless):
 
 
 class Gcp(_Memoryless):
-    """A policy each second; the target is the number of nodes known."""
+    """A policy at each message of the graph; the target is its number of nodes. It asks when a difference is missed."""
 
     def __init__(self) -> None:
-        self._mirror = GraphMirror()
+        self._version = 0
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
         """A policy once there is a graph, and a request when a difference was missed."""
-        fits = all([self._mirror.apply(received.message) for received in inputs.new(GLOBAL_IRM)])
-        asks = [] if fits else [Output(GCP_GRAPH_REQUEST, GraphRequest(stamp_ns=now, have_version=self._mirror.version))]
+        fits = True
+        for received in inputs.new(GLOBAL_IRM):
+            fits = received.message.base_version in (0, self._version)
+            self._version = received.message.irm_version if fits else self._version
+        request = GraphRequest(stamp_ns=now, have_version=self._version)
+        asks = [] if fits else [Output(GCP_GRAPH_REQUEST, request)]
         inputs.current(MISSION)
-        if inputs.current(ODOMETRY) is None or self._mirror.version == 0:
+        if inputs.current(ODOMETRY) is None or self._version == 0:
             return [*asks]
-        nodes = int(self._mirror.road_map().node_id.size)
-        return [Output(GLOBAL_POLICY, global_policy(now, self._mirror.version, nodes)), *asks]
+        return [Output(GLOBAL_POLICY, global_policy(now, self._version, self._version)), *asks]
+
+
+class Maps(_Memoryless):
+    """Risk maps at 4 Hz that take about 100 kB on the link, for they are noise."""
+
+    def __init__(self) -> None:
+        self._rng = np.random.default_rng(1)
+
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+        """One map."""
+        del inputs
+        return [Output(RISK_MAP, risk_map(now, self._rng, MAP_CELLS))]
+
+
+def risk_map(now: Stamp, rng: np.random.Generator, cells: int) -> RiskMap:
+    """A square risk map of noise."""
+    shape = (cells, cells)
+    layers = {
+        name: rng.uniform(0.0, 5.0, shape).astype(np.float32)
+        for name in ("hazard_mean", "hazard_variance", "hazard_cvar", "clearance_m", "elevation_m", "top_m")
+    }
+    grid = GridHeader(resolution_m=0.2, ix0=0, iy0=0, width=cells, height=cells)
+    state = rng.integers(0, 3, shape).astype(np.uint8)
+    return RiskMap(stamp_ns=now, grid=grid, robot_pose=Pose(), footprint_radius_m=0.5, state=state, **layers)
+
+
+class Operator(_Memoryless):
+    """A command at 5 Hz, and nothing else of what status does."""
+
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+        """One command."""
+        del inputs
+        command = MissionCommand(stamp_ns=now, command_id=str(now), kind=CommandKind.PAUSE)
+        return [Output(COMMAND, command)]
 
 
 def make(name: str) -> tuple[StageSpec, Stage]:
     """The fake of a service's name."""
-    made: dict[str, tuple[StageSpec, Stage]] = {
-        "sim": (StageSpec("sim", SECOND_NS // 20), Sim()),
-        "irm": (StageSpec("irm", SECOND_NS // 2, (GCP_GRAPH_REQUEST.name,)), Irm()),
-        "mission": (StageSpec("mission", SECOND_NS // 2), Mission()),
-        "gcp": (StageSpec("gcp", SECOND_NS, (GLOBAL_IRM.name,)), Gcp()),
+    made: dict[str, Callable[[], tuple[StageSpec, Stage]]] = {
+        "sim": lambda: (StageSpec("sim", SECOND_NS // 20), Sim()),
+        "irm": lambda: (StageSpec("irm", SECOND_NS // 2, (GCP_GRAPH_REQUEST.name,)), Irm()),
+        "mission": lambda: (StageSpec("mission", SECOND_NS // 2), Mission()),
+        "gcp": lambda: (StageSpec("gcp", SECOND_NS, (GLOBAL_IRM.name,)), Gcp()),
+        "riskmap": lambda: (StageSpec("riskmap", SECOND_NS // 4), Maps()),
+        "status": lambda: (StageSpec("status", SECOND_NS // 5), Operator()),
     }
-    return made[name]
+    return made[name]()
+
+
+def observe(config: Config, stop: threading.Event, path: str, names: list[str]) -> None:
+    """Write a line for each message: time of receipt (monotonic ns), topic, epoch, sequence, sent_ns, more."""
+    with open(path, "w", encoding="ascii") as file, connect(config.router, config.robot, stop, 120.0) as link:
+        lock = threading.Lock()
+
+        def receive(topic: Topic[Message], payload: bytes) -> None:
+            now_ns = time.monotonic_ns()
+            message, envelope = decode(payload, topic.message, topic.max_bytes)
+            more: Any = None
+            if isinstance(message, GlobalPolicy):
+                more = [message.irm_version, message.target]
+            elif isinstance(message, LinkReport):
+                more = message.model_dump()
+            line = [now_ns, topic.name, envelope.epoch, envelope.sequence, envelope.sent_ns, more]
+            with lock:
+                file.write(json.dumps(line) + "\n")
+                file.flush()
+
+        for name in names:
+            link.subscribe(topic_named(name), receive, every=True)
+        stop.wait()
 
 
 def main() -> None:
-    """Run one until SIGTERM; `router` and `link` are the real ones."""
+    """Run fakes in threads until SIGTERM; `router` and `link` are the real ones, `observe:FILE:TOPIC,...` writes."""
     from plgrim.link.process import run_link
     from plgrim.runtime.router import run_router
 
-    name = sys.argv[1]
     die_with_parent()
-    configure_logs(name)
+    configure_logs("+".join(sys.argv[1:])[:40])
     config = load_config()
     with stop_on_signals() as stop:
-        try:
-            if name == "router":
-                run_router(config.router, stop)
-            elif name == "link":
-                run_link(config, stop)
-            else:
-                drive(name, config, lambda: make(name), stop)
-        except PlgrimError as error:
-            print(f"fake: {error}", file=sys.stderr)
-            sys.exit(error.exit_code)
+        event = threading.Event()
+
+        def run(name: str) -> None:
+            try:
+                if name == "router":
+                    run_router(config.router, event)
+                elif name == "link":
+                    run_link(config, event)
+                elif name.startswith("observe:"):
+                    _, path, topics = name.split(":")
+                    observe(config, event, path, topics.split(","))
+                else:
+                    drive(name, config, lambda: make(name), event)
+            except PlgrimError as error:
+                print(f"fake {name}: {error}", file=sys.stderr)
+
+        threads = [threading.Thread(target=run, args=(name,)) for name in sys.argv[1:]]
+        for thread in threads:
+            thread.start()
+        stop.wait()
+        event.set()
+        for thread in threads:
+            thread.join()
 
 
 if __name__ == "__main__":
