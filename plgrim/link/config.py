@@ -33,7 +33,7 @@ class LinkConfig(BaseModel):
     """At most so much of one topic (`irm/local_irm: 40`); one of which only the newest counts is then sent less often."""
     queue_kb: float = Field(2000.0, gt=0, le=1e6)
     """What a topic of which every message counts may keep waiting; then differences are dropped, and asked for anew."""
-    send_buffer_bytes: int = Field(32_768, ge=4096, le=16_000_000)
+    send_buffer_bytes: int = Field(8192, ge=4096, le=16_000_000)
     """Of the connection for maps: what the kernel holds of them delays everything else on the link."""
     lease_ms: int = Field(2000, ge=200, le=60_000)
     """Silence after which a connection to the base counts as lost, ms."""
