@@ -39,7 +39,7 @@ class LinkConfig(BaseModel):
     """Silence after which a connection to the base counts as lost, ms."""
     silent_after_s: float = Field(2.0, ge=0.2, le=60)
     """So long without a good word from the base's instance, and the robot's own takes over."""
-    hand_back_after_s: float = Field(2.0, ge=0.0, le=600)
+    hand_back_after_s: float = Field(1.5, ge=0.0, le=600)
     """So long in step without a break, and the base's instance is obeyed again; doubles when it fails soon after."""
     behind_after_s: float = Field(2.5, ge=0.2, le=60)
     """An instance whose newest input is older than that is not in step, and what it makes of it is not passed on."""

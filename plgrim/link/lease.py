@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from schemas.contract import SECOND_NS
 
 BASE, STANDBY = "base", "standby"
-_SHORT_TENURE_NS = 20 * SECOND_NS
+_SHORT_TENURE_NS = 10 * SECOND_NS
 _MOST_DOUBLINGS = 3
 _NEVER = -(2**62)
 
@@ -18,7 +18,7 @@ _NEVER = -(2**62)
 @dataclass(frozen=True, slots=True)
 class LeaseTimes:
     """silent_after: without a good word for so long, an instance counts as silent. hand_back_after: the base must have
-    been in step for so long; doubled, up to 8 times, when its last lease was lost within 20 s.
+    been in step for so long; doubled, up to 8 times, when its last lease was lost within 10 s.
     """
 
     silent_after_ns: int
