@@ -49,6 +49,7 @@ class Arbiter:
     seen: Seen
     lease: Lease
     dropped: Counter[str] = field(default_factory=Counter)
+    _marks: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
     _last: dict[tuple[str, str], _Word] = field(default_factory=dict)
     _sequence: Counter[str] = field(default_factory=Counter)
     _unanswered_ns: int | None = None
@@ -74,13 +75,13 @@ class Arbiter:
         except MessageError as error:
             self.dropped[f"{instance}/{topic.name}:{error.reason}"] += 1
             return []
-        self._last[instance, topic.name] = word
         if isinstance(word.message, StageHealth):
             self._judge_health(instance, word, now_ns)
         elif is_request(topic):
             return [self._sealed(word, stamp)]
         elif not self._judge_output(instance, word, now_ns):
-            return []
+            return self.tick(now_ns, stamp)
+        self._last[instance, topic.name] = word
         changed = self.tick(now_ns, stamp)
         if self.lease.holder != instance:
             return changed
@@ -91,12 +92,8 @@ class Arbiter:
         waited = self._unanswered_ns is not None and now_ns - self._unanswered_ns > self._silent_ns
         if not self.lease.tick(now_ns, base_lags=waited):
             return []
-        words = [word for (who, _), word in sorted(self._last.items()) if who == self.lease.holder]
-        return [
-            self._sealed(word, stamp)
-            for word in words
-            if not is_request(word.topic) and now_ns - word.heard_ns <= _WARM_NS
-        ]
+        words = [self._last[key] for key in sorted(self._last) if key[0] == self.lease.holder]
+        return [self._sealed(word, stamp) for word in words if now_ns - word.heard_ns <= _WARM_NS]
 
     @property
     def _silent_ns(self) -> int:
@@ -106,9 +103,10 @@ class Arbiter:
         message, envelope = decode(payload, topic.message, topic.max_bytes)
         if envelope.robot != self.robot or envelope.writer != self.service:
             raise WrongSenderError(f"from {envelope.writer!r} of {envelope.robot!r}")
-        last = self._last.get((instance, topic.name))
-        if last is not None and (envelope.epoch, envelope.sequence) <= _mark(last.envelope):
-            raise WrongSenderError(f"{_mark(envelope)} is not newer than {_mark(last.envelope)}")
+        mark, last = (envelope.epoch, envelope.sequence), self._marks.get((instance, topic.name))
+        if last is not None and mark <= last:
+            raise WrongSenderError(f"{mark} is not newer than {last}")
+        self._marks[instance, topic.name] = mark
         return _Word(topic, message, envelope, now_ns)
 
     def _judge_health(self, instance: str, word: _Word, now_ns: int) -> None:
@@ -135,6 +133,8 @@ class Arbiter:
         if self._lag_ns(word, now_ns) > self.config.ns("behind_after_s"):
             self.dropped[f"{instance}/{word.topic.name}:behind"] += 1
             self.lease.bad(instance)
+            if self._unanswered_ns is None:
+                self._unanswered_ns = self._base_output_ns if self._base_output_ns is not None else now_ns
             return False
         self._base_output_ns, self._unanswered_ns = now_ns, None
         return True
@@ -159,10 +159,6 @@ class Arbiter:
         """Since the last good word of the base's instance; -1: none yet."""
         age_ns = self.lease.good_age_ns(BASE, now_ns)
         return -1.0 if age_ns < 0 else age_ns / SECOND_NS
-
-
-def _mark(envelope: Envelope) -> tuple[int, int]:
-    return envelope.epoch, envelope.sequence
 
 
 def note_robot(seen: Seen, topic: Topic[Message], payload: bytes, mark: tuple[int, int], now_ns: int) -> None:

@@ -30,7 +30,7 @@ class LinkConfig(BaseModel):
     topic_kb_per_s: dict[str, float] = Field(
         default_factory=lambda: {"sim/odometry": 8.0, "reconciler/plan": 16.0, "riskmap/risk_map": 60.0}
     )
-    """At most so much of one topic (`irm/local_irm: 40`); one of which only the newest counts is then sent less often."""
+    """At most so much of one topic (`irm/local_irm: 40`); where only the newest counts it is then sent less often."""
     queue_kb: float = Field(2000.0, gt=0, le=1e6)
     """What a topic of which every message counts may keep waiting; then differences are dropped, and asked for anew."""
     send_buffer_bytes: int = Field(8192, ge=4096, le=16_000_000)

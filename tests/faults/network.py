@@ -53,7 +53,21 @@ class Network:
             _run("ip", "netns", "add", space)
             self.on(host, "ip", "link", "set", "lo", "up")
         robot, base = self._spaces[ROBOT], self._spaces[BASE]
-        _run("ip", "link", "add", "radio", "netns", robot, "type", "veth", "peer", "name", "radio", "netns", base)
+        _run(
+            "ip",
+            "link",
+            "add",
+            "radio",
+            "netns",
+            robot,
+            "type",
+            "veth",
+            "peer",
+            "name",
+            "radio",
+            "netns",
+            base,
+        )
         for host, address in _ADDRESS.items():
             self.on(host, "ip", "address", "add", f"{address}/24", "dev", "radio")
             self.on(host, "ip", "link", "set", "radio", "up")

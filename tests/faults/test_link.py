@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from tests.faults.network import BASE, ROBOT, Network, cut_off, require_network
 
 FAKES = ("-m", "tests.link.fakes")
 ROBOT_TOPICS = "gcp/global_policy,sim/odometry,irm/global_irm,riskmap/risk_map,link/report,status/command"
-BASE_TOPICS = "gcp/global_policy,mission/state,sim/health,mission/health,irm/global_irm,riskmap/risk_map,link/report"
+BASE_TOPICS = (
+    "gcp/global_policy,mission/state,sim/health,mission/health,irm/global_irm,riskmap/risk_map,link/report"
+)
 
 
 class Line:
@@ -45,7 +48,7 @@ def quantile(values: list[float], share: float) -> float:
 
 def gaps(found: list[Line]) -> list[float]:
     """Seconds between messages that follow one another."""
-    return [b.at_s - a.at_s for a, b in zip(found, found[1:], strict=False)]
+    return [b.at_s - a.at_s for a, b in pairwise(found)]
 
 
 class Site:
@@ -130,11 +133,15 @@ def test_maps_do_not_delay_commands_and_heartbeats(
         bad += [topic] if missing or p95 >= 0.3 else []
     maps = during(site.base_file, "riskmap/risk_map")
     report = lines(site.base_file, "link/report")[-1].more
-    print(f"maps: {len(maps)}, p95 {quantile([m.latency_s for m in maps], 0.95):.2f} s; {report['down_kb_per_s']}")
+    print(
+        f"maps: {len(maps)}, p95 {quantile([m.latency_s for m in maps], 0.95):.2f} s; {report['down_kb_per_s']}"
+    )
     assert not bad
     assert len(maps) > 5
     if maps_kb_per_s == "120":
-        assert 60.0 < report["down_kb_per_s"]["riskmap/risk_map"] < 120.0 * 1.2 + 20.0  # one map in 5 s: 20 kB/s
+        assert (
+            60.0 < report["down_kb_per_s"]["riskmap/risk_map"] < 120.0 * 1.2 + 20.0
+        )  # one map in 5 s: 20 kB/s
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.15], ids=["clean", "lossy"])
@@ -174,7 +181,9 @@ def test_a_cut_is_survived_and_mended(network: Network, tmp_path: Path, loss: fl
     )
     assert takeover_s < 5.0
     assert policy_gap < 5.0
-    assert local_gap < 1.0  # nothing on the robot waits for the link; the machine itself may stall for a moment
+    assert (
+        local_gap < 1.0
+    )  # nothing on the robot waits for the link; the machine itself may stall for a moment
     assert took_s < limit_s
     assert_never_stale(policies, lines(site.robot_file, "irm/global_irm"))
 

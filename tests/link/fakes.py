@@ -24,7 +24,14 @@ from plgrim.runtime.zenoh_session import connect
 from schemas.base import Message, Pose
 from schemas.codec import decode
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSpec, Stamp, Topic
-from schemas.operation import CommandKind, FinishReason, LinkReport, MissionCommand
+from schemas.operation import (
+    CommandKind,
+    FinishReason,
+    JudgeReport,
+    LinkReport,
+    MissionCommand,
+    MissionState,
+)
 from schemas.policy import GlobalPolicy
 from schemas.topics import (
     COMMAND,
@@ -216,8 +223,8 @@ def observe(config: Config, stop: threading.Event, path: str, names: list[str]) 
             more: Any = None
             if isinstance(message, GlobalPolicy):
                 more = [message.irm_version, message.target]
-            elif isinstance(message, LinkReport):
-                more = message.model_dump()
+            elif isinstance(message, LinkReport | MissionState | JudgeReport):
+                more = message.model_dump(mode="json")
             line = [now_ns, topic.name, envelope.epoch, envelope.sequence, envelope.sent_ns, more]
             with lock:
                 file.write(json.dumps(line) + "\n")
