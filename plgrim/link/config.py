@@ -22,7 +22,7 @@ class LinkConfig(BaseModel):
     endpoint: str = Field("", pattern=r"^$|^(tcp|tls|quic)/.+")
     """The base's router, as the robot dials it (`tls/base:7447`). Empty: no link."""
     at_base: tuple[MayMove, ...] = ("gcp", "status")
-    """Services that run at the base. Of irm, lcp and gcp a standby runs on the robot."""
+    """Services that run at the base. Of lcp and gcp a standby runs on the robot. irm is refused, with the reason."""
     commands_kb_per_s: float = Field(60.0, gt=0, le=1e6)
     """At most so much from robot to base on the lane of commands, plans, states and heartbeats."""
     maps_kb_per_s: float = Field(120.0, gt=0, le=1e6)
@@ -43,6 +43,16 @@ class LinkConfig(BaseModel):
     """So long in step without a break, and the base's instance is obeyed again; doubles when it fails soon after."""
     behind_after_s: float = Field(2.5, ge=0.2, le=60)
     """An instance whose newest input is older than that is not in step, and what it makes of it is not passed on."""
+
+    @field_validator("at_base")
+    @classmethod
+    def _not_irm(cls, value: tuple[MayMove, ...]) -> tuple[MayMove, ...]:
+        if "irm" in value:
+            raise ValueError(
+                "irm cannot run at the base yet: the looks and risk maps of a cut never reach it, and nothing brings "
+                "its graph in step with the standby's again; leave it on the robot"
+            )
+        return value
 
     @field_validator("topic_kb_per_s")
     @classmethod

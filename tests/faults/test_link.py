@@ -162,7 +162,7 @@ def test_a_cut_is_survived_and_mended(network: Network, tmp_path: Path, loss: fl
 
     def graph_is_there() -> bool:
         here, there = lines(site.robot_file, "irm/global_irm"), lines(site.base_file, "irm/global_irm")
-        return there[-1].at_s > joined_s and here[-1].sequence - there[-1].sequence <= 2
+        return bool(there[-1].at_s > joined_s) and here[-1].sequence - there[-1].sequence <= 2
 
     graph_s = site.wait(graph_is_there, "the base had the newest graph", 60.0)
     took_s = graph_s + site.wait(lambda: site.holder() == "base", "the base was obeyed again", 60.0)

@@ -16,6 +16,7 @@ from schemas.base import Message
 from schemas.codec import Envelope, decode, encode
 from schemas.contract import SECOND_NS, Topic
 from schemas.operation import StageHealth
+from schemas.policy import GlobalPolicy
 from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, ODOMETRY, health_topic, read_by
 from schemas.world import GraphRequest
 from tests.link.fakes import global_irm, global_policy
@@ -85,7 +86,7 @@ class _World:
             if topic is not GLOBAL_POLICY:
                 continue
             assert self.readers.accept(topic, payload, 0), self.readers.last_refusal
-            self.passed.append((decode(payload, topic.message, topic.max_bytes)[0].irm_version, self.now_ms))
+            self.passed.append((decode(payload, GlobalPolicy, topic.max_bytes)[0].irm_version, self.now_ms))
 
     def second(self, base: bool = True, standby: bool = True, base_late: int = 0) -> None:
         """One second: the robot speaks, then each instance that lives; base_late: graphs that it is behind."""

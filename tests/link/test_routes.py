@@ -72,6 +72,7 @@ def test_instances() -> None:
     [
         ({"at_base": ["riskmap"]}, "at_base"),
         ({"at_base": ["reconciler"]}, "at_base"),
+        ({"at_base": ["irm"]}, "irm cannot run at the base yet"),
         ({"topic_kb_per_s": {"sim/cloud": 5}}, "no topic that crosses"),
         ({"topic_kb_per_s": {"sim/odometry": 0}}, "cannot be shut off"),
         ({"endpoint": "base:7447"}, "endpoint"),
