@@ -71,11 +71,17 @@ class SplitMission:
             time.sleep(0.2)
 
     def run(self, cuts: int, cut_s: float, calm_s: float, limit_s: float) -> None:
-        """Cut as often while the mission lasts; return at its end."""
-        deadline, due = time.monotonic() + limit_s, time.monotonic() + calm_s
+        """Cut as often while the mission lasts, from when the robot drives on; return at its end."""
+        deadline = time.monotonic() + limit_s
+        while not self.driven_m() > 0.2 and time.monotonic() < deadline:
+            time.sleep(0.1)
+        due = base_since = time.monotonic()
         while not self.finish() and time.monotonic() < deadline:
             time.sleep(0.1)
-            if len(self.cuts) < cuts and time.monotonic() >= due and self.holder() == BASE:
+            if self.holder() != BASE:
+                base_since = time.monotonic()
+            settled = time.monotonic() > base_since + 11.0  # a lease that is lost sooner is given back later
+            if len(self.cuts) < cuts and time.monotonic() >= due and settled:
                 self.network.cut()
                 began_s = time.monotonic()
                 time.sleep(cut_s)
@@ -97,6 +103,11 @@ class SplitMission:
         """Why the mission has ended, by its newest state; empty while it goes on."""
         states = self.of("mission/state")
         return str(states[-1].more["finish"]) if states else ""
+
+    def driven_m(self) -> float:
+        """By the judge."""
+        heard = self.of("sim/judge")
+        return float(heard[-1].more["distance_m"]) if heard else 0.0
 
     def coverage(self) -> float:
         """By the judge."""
