@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from plgrim.commands import doctor, evaluate, feed, foxglove, inspect, missions, record, report, services
+from plgrim.commands import doctor, evaluate, feed, foxglove, inspect, link, missions, record, report, services
 from plgrim.commands.examples import add_examples
 from plgrim.errors import PlgrimError
 
@@ -16,7 +16,7 @@ application = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_show_locals=False,
 )
-for room in (missions, services, doctor, record, report, foxglove, feed, evaluate, inspect):
+for room in (missions, services, link, doctor, record, report, foxglove, feed, evaluate, inspect):
     room.register(application)
 add_examples(application)
 

@@ -77,6 +77,7 @@ class SharedStatus:
         """
         with self._lock:
             numbers, report = self._core.numbers(self._now_ns()), self._core.status(self._now_ns())
+            link = self._core.link()
         registry = CollectorRegistry()
         for name, value in numbers.items():
             Gauge(f"plgrim_{name}", name.replace("_", " "), registry=registry).set(value)
@@ -88,6 +89,11 @@ class SharedStatus:
         for stage in report.stages:
             for reason, count in stage.dropped.items():
                 dropped.labels(stage.service, reason).set(count)
+        if link is not None:
+            used = Gauge("plgrim_link_kb_per_s", "use of the link", ["way", "topic"], registry=registry)
+            for way, rates in (("down", link.down_kb_per_s), ("up", link.up_kb_per_s)):
+                for topic, rate in rates.items():
+                    used.labels(way, topic).set(rate)
         return generate_latest(registry)
 
 

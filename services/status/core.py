@@ -14,7 +14,7 @@ from planning.graph_mirror import FRONTIER, GraphMirror
 from planning.grid import GridSpec
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS
-from schemas.operation import JudgeReport, MissionState, StageHealth
+from schemas.operation import JudgeReport, LinkReport, MissionState, StageHealth
 from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
@@ -143,6 +143,10 @@ class StatusCore:
             stages=self._stages(now_ns),
             topics=self._topics(now_ns),
         )
+
+    def link(self) -> LinkReport | None:
+        """The newest report of the link to the base; None when there is no link."""
+        return self._latest("link/report", LinkReport)
 
     def _latest(self, topic_name: str, kind: type[_M]) -> _M | None:
         seen = self._seen.get(topic_name)

@@ -93,6 +93,7 @@ def test_metrics(client: TestClient, shared: SharedStatus) -> None:
     assert "plgrim_coverage_belief 0.75" in text
     assert 'plgrim_stage_step_p99_ms{service="gcp"} 0.75' in text
     assert 'plgrim_dropped{reason="sim/cloud:bad_checksum",service="gcp"} 2.0' in text
+    assert 'plgrim_link_kb_per_s{topic="sim/cloud:bad_checksum",way="down"} 0.75' in text
 
 
 def test_page_loads_nothing_from_elsewhere(client: TestClient) -> None:
