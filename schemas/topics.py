@@ -6,7 +6,14 @@ from typing import Any
 
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Topic
-from schemas.operation import JudgeReport, MissionCommand, MissionState, StageHealth, WorldPicture
+from schemas.operation import (
+    JudgeReport,
+    MissionCommand,
+    MissionState,
+    StageHealth,
+    SupervisorReport,
+    WorldPicture,
+)
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPolicy, Plan
 from schemas.sensing import CoverageScan, FollowerState, Odometry, PointCloud, PoseGraph, ReadyGrid
 from schemas.world import (
@@ -21,6 +28,9 @@ from schemas.world import (
 
 SERVICES = ("riskmap", "irm", "gcp", "lcp", "reconciler", "mission", "status", "sim")
 """The services, in the order in which lock-step runs those that are due at the same time."""
+
+WRITERS = (*SERVICES, "supervisor")
+"""Who may write: the services, and what starts them."""
 
 _MS = SECOND_NS // 1000
 _KIB = 1024
@@ -146,10 +156,15 @@ COMMAND: Topic[MissionCommand] = _topic(
     max_bytes=4 * _KIB, link=True,
 )  # fmt: skip
 
+SUPERVISOR: Topic[SupervisorReport] = _topic(
+    SupervisorReport, "supervisor/report", "reconciler status", "which services have failed, are late or degraded",
+    period_ms=1000, max_bytes=64 * _KIB, link=True,
+)  # fmt: skip
+
 TOPICS: tuple[Topic[Message], ...] = (
     CLOUD, READY_GRID, ODOMETRY, POSE_GRAPH, COVERAGE_SCAN, FOLLOWER, JUDGE, WORLD_PICTURE, RISK_MAP, MOVING, LOCAL_IRM,
     GLOBAL_IRM, COVERAGE, COVERAGE_WINDOW, GLOBAL_POLICY, GCP_GRAPH_REQUEST, MISSION_GRAPH_REQUEST,
-    STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, MISSION, COMMAND,
+    STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, MISSION, COMMAND, SUPERVISOR,
 )  # fmt: skip
 """All topics of the stages. Health topics come on top: `health_topic`."""
 

@@ -6,7 +6,6 @@ taken between steps, never inside one.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Protocol, TypeVar
 from plgrim.config import RuntimeConfig
 from plgrim.errors import JournalError
 from plgrim.logs import get_logger
+from plgrim.runtime.durable import write_whole
 from plgrim.runtime.journal import Journal, Recovered
 from schemas.contract import SECOND_NS, Journaling, Outputs, Resuming, Stamp
 
@@ -99,7 +99,9 @@ class Keeper:
             _write_number(self._tries, tries + 1)
             _tell(stage)
         self._begin(stage, now)
-        if self.trouble:
+        if (
+            self.trouble and not self.recovered
+        ):  # the user's to mend; a robot on its way goes on without a journal
             raise JournalError(self.trouble)
         return stage
 
@@ -191,10 +193,7 @@ def _read_number(path: Path) -> int:
 
 def _write_number(path: Path, number: int) -> None:
     """Write a small file whole or not at all; a failure is logged, for nothing hangs on it alone."""
-    fresh = path.with_suffix(f"{path.suffix}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fresh.write_text(str(number), encoding="ascii")
-        fresh.replace(path)
+        write_whole(path, str(number))
     except OSError as error:
         get_logger().warning("not written", file=str(path), error=str(error))

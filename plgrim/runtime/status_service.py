@@ -80,6 +80,7 @@ def _serve(
         service.link.subscribe(topic, feed.accept)
     service.mailbox_report = feed.report
     server.start()
+    service.monitor.expect(_TICK_S)
     service.monitor.ready = True
     get_logger().info("ready", page=page_address(server.shared.config.host, server.port))
     while not stop.wait(_TICK_S):
@@ -91,6 +92,7 @@ def _serve(
             service.link.publish(STATUS_GRAPH_REQUEST, payload)
         if keeper is not None:
             keeper.after_step(server.shared, now)
+            service.monitor.degraded = keeper.trouble
         service.monitor.step_ended()
     if keeper is not None:
         keeper.close(server.shared, service.clock.now_ns())

@@ -205,14 +205,16 @@ def free_port() -> int:
         return port
 
 
-def fault_config(sim: dict[str, Any], seed: int, speed: float) -> Config:
+def fault_config(
+    sim: dict[str, Any], seed: int, speed: float, runtime: dict[str, Any] | None = None
+) -> Config:
     """A configuration of its own ports and clock, that forgives as many restarts as are caused here."""
     return load_config(
         overrides={
             "seed": seed,
             "router": {"endpoint": f"tcp/127.0.0.1:{free_port()}"},
             "clock": {"speed": speed, "origin_ns": time.monotonic_ns()},
-            "runtime": {"restarts": 50, "health_period_s": 0.1},
+            "runtime": {"restarts": 50, "health_period_s": 0.1, **(runtime or {})},
             "sim": sim,
             "status": {"port": free_port()},
         }

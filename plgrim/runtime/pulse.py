@@ -1,0 +1,85 @@
+"""The pulse of a service: a few numbers in a small shared file, written by the service, watched by its supervisor.
+
+Progress, not life: how many steps have ended, and how many heartbeats. A file rather than a message, since it must tell
+the truth when the service holds Python's lock in an endless loop, is stopped, or has lost its router.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+VARIABLE = "PLGRIM_PULSE"
+_WORDS = struct.Struct("<4q")
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What a pulse says. pid: of the service (0: not begun). period_ns: wall time between two steps, 0 before the first
+    step may be expected. steps, beats: so many have ended since the process began."""
+
+    pid: int = 0
+    period_ns: int = 0
+    steps: int = 0
+    beats: int = 0
+
+
+class Pulse:
+    """The writing side; without a file it does nothing."""
+
+    def __init__(self, path: Path | None) -> None:
+        """path: made if need be. OSError when it cannot be written."""
+        self._words: memoryview | None = None
+        if path is None:
+            return
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            os.ftruncate(descriptor, _WORDS.size)
+            self._words = memoryview(mmap.mmap(descriptor, _WORDS.size)).cast("q")
+        finally:
+            os.close(descriptor)
+        for index, value in enumerate((0, 0, 0, os.getpid())):  # the pid last: until then nothing is believed
+            self._words[(index + 1) % 4] = value
+
+    @classmethod
+    def of_environment(cls) -> Pulse:
+        """The pulse that the supervisor has asked for; none when nobody has, or the file cannot be written."""
+        path = os.environ.get(VARIABLE, "")
+        try:
+            return cls(Path(path) if path else None)
+        except OSError:
+            return cls(None)
+
+    def expect(self, period_s: float) -> None:
+        """From now on a step ends at least once in `period_s` wall seconds."""
+        if self._words is not None:
+            self._words[1] = max(1, round(period_s * 1e9))
+
+    def stepped(self) -> None:
+        """A step has ended."""
+        if self._words is not None:
+            self._words[2] += 1
+
+    def beat(self) -> None:
+        """The heartbeat's thread was here."""
+        if self._words is not None:
+            self._words[3] += 1
+
+
+def clear_pulse(path: Path) -> None:
+    """A new file for a new process: the old one may still be written. OSError when it cannot be made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.unlink(missing_ok=True)
+    path.write_bytes(bytes(_WORDS.size))
+
+
+def read_pulse(path: Path) -> Reading:
+    """What the file says now; all zero when there is none."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return Reading()
+    return Reading(*_WORDS.unpack(content)) if len(content) == _WORDS.size else Reading()
