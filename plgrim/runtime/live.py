@@ -104,6 +104,7 @@ class LiveDriver:
         for topic in self._mailbox.topics:
             self._service.link.subscribe(topic, self._accept)
         self._service.mailbox_report = self._mailbox_report
+        self._service.monitor.pulse.listen_to_numba()
         self._service.monitor.expect(self._clock.wall_seconds(self._spec.period_ns))
         self._service.monitor.ready = True
         self._log.info("ready", period_ms=self._spec.period_ns / 1e6, topics=len(self._mailbox.topics))

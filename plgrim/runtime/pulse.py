@@ -9,22 +9,25 @@ from __future__ import annotations
 import mmap
 import os
 import struct
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 VARIABLE = "PLGRIM_PULSE"
-_WORDS = struct.Struct("<4q")
+_WORDS = struct.Struct("<5q")
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
     """What a pulse says. pid: of the service (0: not begun). period_ns: wall time between two steps, 0 before the first
-    step may be expected. steps, beats: so many have ended since the process began."""
+    step may be expected. steps, beats: so many have ended since the process began. compiling: so many kernels are being
+    compiled, which happens once for a version of the program and takes long: no fault."""
 
     pid: int = 0
     period_ns: int = 0
     steps: int = 0
     beats: int = 0
+    compiling: int = 0
 
 
 class Pulse:
@@ -41,8 +44,9 @@ class Pulse:
             self._words = memoryview(mmap.mmap(descriptor, _WORDS.size)).cast("q")
         finally:
             os.close(descriptor)
-        for index, value in enumerate((0, 0, 0, os.getpid())):  # the pid last: until then nothing is believed
-            self._words[(index + 1) % 4] = value
+        for index in (1, 2, 3, 4):
+            self._words[index] = 0
+        self._words[0] = os.getpid()  # last: until then nothing is believed
 
     @classmethod
     def of_environment(cls) -> Pulse:
@@ -67,6 +71,30 @@ class Pulse:
         """The heartbeat's thread was here."""
         if self._words is not None:
             self._words[3] += 1
+
+    def compiling(self, more: int) -> None:
+        """One more kernel (1) or one less (-1) is being compiled now; they nest."""
+        if self._words is not None:
+            self._words[4] += more
+
+    def listen_to_numba(self) -> None:
+        """Note when numba compiles; not when it loads what was compiled before. For a stage that uses it."""
+        if self._words is None or "numba" not in sys.modules:
+            return
+        from numba.core import event
+
+        count = self.compiling
+
+        class Listener(event.Listener):  # type: ignore[misc]
+            """Counts what has begun and not ended."""
+
+            def on_start(self, found: object) -> None:
+                count(1)
+
+            def on_end(self, found: object) -> None:
+                count(-1)
+
+        event.register("numba:compile", Listener())
 
 
 def clear_pulse(path: Path) -> None:

@@ -241,6 +241,11 @@ class Supervisor:
         child.failed, child.ready_s = why, time.monotonic()
         self._log.error("FAILED: the robot holds", child=child.name, why=why)
 
+    @property
+    def spare_warm(self) -> bool:
+        """Whether the next service that dies comes back from a warm spare; True where none is kept."""
+        return self._spare is None or self._spare.warm
+
     def failed(self) -> dict[str, str]:
         """The services that are not started any more, and why."""
         return {child.name: child.failed for child in self._services() if child.failed}

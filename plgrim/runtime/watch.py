@@ -42,7 +42,7 @@ class Watched:
         self.silent_s = 0.0 if reading.beats != self.reading.beats else self.silent_s + passed_s
         self.reading = reading
         if not self.expected:
-            self.late_s = 0.0
+            self.late_s = self.silent_s = 0.0
         limit_s = FLAG_PERIODS * reading.period_ns / 1e9
         if not self.late_s or self.late_s < limit_s:
             self.flagged_s, self.told = None, False
@@ -52,7 +52,8 @@ class Watched:
     @property
     def expected(self) -> bool:
         """Whether steps can be expected: the first one may have to load or compile what it needs."""
-        return bool(self.reading.pid and self.reading.period_ns and self.reading.steps)
+        r = self.reading
+        return bool(r.pid and r.period_ns and r.steps and not r.compiling)
 
 
 class Watch:
