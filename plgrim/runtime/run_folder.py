@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
@@ -11,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from plgrim.config import Config, load_config
-from plgrim.errors import AlreadyRunningError, ConfigError
+from plgrim.errors import ConfigError
 from plgrim.runtime.durable import write_whole
+from plgrim.runtime.lock import Lock
 from schemas.contract import SECOND_NS
 
 _CLOCK = "clock.json"
@@ -20,27 +20,6 @@ _CLOCK_PERIOD_S = 1.0
 _MARGIN_S = 3.0
 """After a reboot the mission clock goes on so much after its last entry: never before what was said meanwhile."""
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
-
-
-class Lock:
-    """A lock on a file that lives as long as this process, held by one at a time."""
-
-    def __init__(self, path: Path, what: str, mend: str) -> None:
-        """what, mend: for the text of AlreadyRunningError, which is raised when another process holds it."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
-        try:
-            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            holder = os.pread(self._descriptor, 32, 0).decode("ascii", "replace").strip()
-            self.close()
-            raise AlreadyRunningError(f"{path}: {what} (process {holder or 'unknown'}): {mend}") from error
-        os.ftruncate(self._descriptor, 0)
-        os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
-
-    def close(self) -> None:
-        """Let it go. The file stays: removing it would let two hold it."""
-        os.close(self._descriptor)
 
 
 def lock_run_folder(folder: Path) -> Lock:

@@ -59,7 +59,8 @@ def run_writer(
     }
     command = [sys.executable, str(WRITER), str(folder / "state"), str(acks), str(generations), str(records)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    if done.returncode:
+        raise RuntimeError(done.stderr)
     return list(_parse(log.read_bytes())), done.stdout
 
 
@@ -156,8 +157,8 @@ class Disk:
             (len(self._moves), nothing),
         ]
         for seed in seeds:
-            rng = random.Random(seed)
-            cases.append((rng.randint(0, len(self._moves)), rng))
+            chance = random.Random(seed)
+            cases.append((chance.randint(0, len(self._moves)), chance))
         for number, (moves, rng) in enumerate(cases):
             folder = target / str(number)
             folder.mkdir(parents=True)

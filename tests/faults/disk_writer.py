@@ -1,4 +1,4 @@
-"""Writes a journal as a service does: `python disk_writer.py FOLDER ACKS GENERATIONS RECORDS`, for the tests of the disk.
+"""Writes a journal as a service does: `python disk_writer.py FOLDER ACKS GENERATIONS RECORDS`, for tests of the disk.
 
 What it takes for safe goes to the file ACKS: `epoch E`, and `known N` for N records that the journal must know of.
 """
