@@ -23,23 +23,24 @@ from schemas.contract import Topic
 from schemas.policy import Plan
 from schemas.topics import PLAN
 
+_LARGE_BYTES = 1024 * 1024
 M = TypeVar("M", bound=Message)
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """One message as it was heard. at_s: monotonic seconds."""
+    """One message as it was heard. at_s: monotonic seconds. message: None where it is large."""
 
     at_s: float
     envelope: Envelope
-    message: Message
+    message: Message | None = field(repr=False)
 
 
 @dataclass(slots=True)
 class Ear:
-    """Keeps every message of some topics."""
+    """Keeps every message of some topics; of large ones (maps) only the envelope."""
 
-    said: dict[str, list[Said]] = field(default_factory=dict)
+    said: dict[str, list[Said]] = field(default_factory=dict, repr=False)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def attach(self, link: Link, *topics: Topic[Any]) -> None:
@@ -51,7 +52,8 @@ class Ear:
     def _hear(self, topic: Topic[Message], payload: bytes) -> None:
         message, envelope = decode(payload, topic.message, topic.max_bytes)
         with self._lock:
-            self.said[topic.name].append(Said(time.monotonic(), envelope, message))
+            large = topic.max_bytes > _LARGE_BYTES
+            self.said[topic.name].append(Said(time.monotonic(), envelope, None if large else message))
 
     def since(self, topic: Topic[Any], at_s: float) -> list[Said]:
         """What was heard of a topic after a moment."""

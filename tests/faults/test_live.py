@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,25 +112,25 @@ def test_a_risk_map_that_freezes_holds_the_robot(system: System) -> None:
     os.kill(system.pid("riskmap"), signal.SIGSTOP)
     stopped = time.monotonic()
 
-    def held() -> bool:
-        return any(p.safety == SafetyState.HOLD and not p.valid for _, p in system.ear.plans(stopped))
+    def holds() -> list[float]:
+        plans = system.ear.plans(stopped)
+        return [
+            t for t, p in plans if p.safety == SafetyState.HOLD and "risk map" in p.reason and not p.valid
+        ]
 
-    system.until(held, "the plan says HOLD")
-    at_s = next(t for t, p in system.ear.plans(stopped) if p.safety == SafetyState.HOLD)
+    system.until(holds, "the plan says HOLD")
+    at_s = holds()[0]
     last = max(s.at_s for s in system.ear.said[RISK_MAP.name] if s.at_s <= at_s)
     limit_s = 1.5 + PLAN.period_ns / SECOND_NS
     print(f"\nHOLD {at_s - last:.2f} s after the last risk map")
     assert at_s - last < limit_s + MARGIN_S
-    assert not any(p.valid for t, p in system.ear.plans(at_s) if t < at_s + 0.2)
 
 
 def test_a_slow_consumer_is_its_own_trouble(system: System) -> None:
     """It sleeps in every message: publishers keep their rate, what it gets is fresh, and it does not grow."""
     config = system.supervisor.config
     clock, ages = MissionClock.of(config.clock), []
-    before = time.monotonic()
-    system.run(5.0)
-    calm = len(system.ear.since(ODOMETRY, before)) / 5.0
+    nominal = SECOND_NS / ODOMETRY.period_ns
 
     def slowly(topic: Topic[Message], payload: bytes) -> None:
         _, envelope = decode(payload, topic.message, topic.max_bytes)
@@ -137,8 +138,6 @@ def test_a_slow_consumer_is_its_own_trouble(system: System) -> None:
         time.sleep(1.0)
 
     memory = psutil.Process().memory_info().rss
-    import threading
-
     with connect(config.router, config.robot, threading.Event(), 5.0) as link:
         for topic in (ODOMETRY, RISK_MAP):
             link.subscribe(topic, slowly)
@@ -147,8 +146,8 @@ def test_a_slow_consumer_is_its_own_trouble(system: System) -> None:
         busy = len(system.ear.since(ODOMETRY, began)) / 10.0
     grown = (psutil.Process().memory_info().rss - memory) / 2**20
     worst = {name: max(age for n, age in ages if n == name) for name, _ in ages}
-    print(f"\nodometry {calm:.1f} then {busy:.1f} Hz; oldest samples {worst}; memory {grown:+.1f} MiB")
-    assert busy > 0.9 * calm
+    print(f"\nodometry {busy:.1f} Hz of {nominal:.1f}; oldest samples {worst}; memory {grown:+.1f} MiB")
+    assert busy > 0.9 * nominal
     assert worst[ODOMETRY.name] < ODOMETRY.period_ns / SECOND_NS + MARGIN_S
     assert worst[RISK_MAP.name] < RISK_MAP.period_ns / SECOND_NS + MARGIN_S
     assert grown < 40.0
