@@ -14,7 +14,7 @@ import zenoh
 
 from plgrim.config import Config, check_service
 from plgrim.errors import ServiceFailedError
-from plgrim.logs import get_logger
+from plgrim.logs import Seldom, get_logger
 from plgrim.registry import stage_module, world_errors
 from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.mailbox import Mailbox, Outbox
@@ -95,6 +95,7 @@ class LiveDriver:
         self._triggered = False
         self._triggers = frozenset(spec.triggers)
         self._errors_in_a_row = 0
+        self._refusals = Seldom()
         self._log = get_logger()
 
     def run(self, stop: threading.Event) -> None:
@@ -134,8 +135,8 @@ class LiveDriver:
             if accepted and topic.name in self._triggers:
                 self._triggered = True
                 self._wake.notify()
-        if refusal:
-            self._log.warning("message refused", reason=refusal)
+        if refusal and (more := self._refusals.more(topic.name)):
+            self._log.warning("message refused", reason=refusal, times=more)
 
     def _wait(self, due: Stamp, stop: threading.Event) -> bool:
         """Wait until `due` or a trigger; True for a trigger. Short waits, since a signal only sets `stop`."""

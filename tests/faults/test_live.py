@@ -130,7 +130,7 @@ def test_a_slow_consumer_is_its_own_trouble(system: System) -> None:
     """It sleeps in every message: publishers keep their rate, what it gets is fresh, and it does not grow."""
     config = system.supervisor.config
     clock, ages = MissionClock.of(config.clock), []
-    nominal = SECOND_NS / ODOMETRY.period_ns
+    nominal = _calm(system)
 
     def slowly(topic: Topic[Message], payload: bytes) -> None:
         _, envelope = decode(payload, topic.message, topic.max_bytes)
@@ -157,6 +157,7 @@ def test_an_hour_on_the_wall_clock_changes_nothing(system: System) -> None:
     """Forward, back, and back again: no service restarts, no message is refused, the robot keeps driving."""
     if system.clock_offset is None:
         pytest.skip("needs Linux and a C compiler")
+    _calm(system)
     restarted = {name: child.restarted for name, child in system.supervisor.children.items()}
     refused = _refused(system)
     began = time.monotonic()
@@ -185,6 +186,17 @@ def test_a_service_that_restarts_an_hour_in_the_past_is_heard(system: System) ->
     assert system.ear.said[MISSION.name][-1].envelope.epoch < epoch + 60_000
     system.set_clock(0.0)
     system.until(system.whole, "the robot drives on")
+
+
+def _calm(system: System) -> float:
+    """Odometry's nominal rate, Hz. Skips, visibly, on a machine that cannot keep it with no fault at all."""
+    system.run(2.0)
+    began, nominal = time.monotonic(), SECOND_NS / ODOMETRY.period_ns
+    system.run(5.0)
+    rate = len(system.ear.since(ODOMETRY, began)) / 5.0
+    if rate < 0.95 * nominal or any(p.safety == SafetyState.HOLD for _, p in system.ear.plans(began)):
+        pytest.skip(f"the machine is too busy: odometry at {rate:.1f} of {nominal:.1f} Hz without a fault")
+    return nominal
 
 
 def _refused(system: System) -> int:
