@@ -90,7 +90,10 @@ def judge_process(name: str, cpu: float, minutes: list[float], mib: list[float])
     warm = len(mib) // 3
     slope = float(np.polyfit(minutes[warm:], mib[warm:], 1)[0]) if len(mib) - warm > 2 else 0.0
     cpu_most, mib_most = BUDGET[name]
-    line = f"{name:<12} {100 * cpu:6.1f} % of {100 * cpu_most:3.0f} % {max(mib):7.0f} of {mib_most:4.0f} MiB {slope:+7.2f} MiB/min"
+    line = (
+        f"{name:<12} {100 * cpu:6.1f} % of {100 * cpu_most:3.0f} % "
+        f"{max(mib):7.0f} of {mib_most:4.0f} MiB {slope:+7.2f} MiB/min"
+    )
     wrong = [f"{name}: {100 * cpu:.0f} % CPU"] if cpu > cpu_most else []
     wrong += [f"{name}: {max(mib):.0f} MiB"] if max(mib) > mib_most else []
     wrong += [f"{name}: memory grows by {slope:.1f} MiB/min"] if slope > SLOPE_MIB_PER_MIN else []
@@ -123,9 +126,7 @@ def soak(minutes: float, world: str, folder: Path) -> list[str]:
         cpu = {n: (sum(p.cpu_times()[:2]) - before[n]) / passed for n, p in processes.items()}
         restarted = {n: c.restarted for n, c in supervisor.children.items() if c.restarted}
         flags = dict(supervisor.watch.flags)
-    table: list[tuple[str, list[str]]] = [
-        ("\ntopic                      nominal Hz   off   longest interval, periods", [])
-    ]
+    table: list[tuple[str, list[str]]] = [("\ntopic: nominal Hz, off, longest interval in periods", [])]
     table += [judge_rate(t.name, t.period_ns / SECOND_NS, rates.at_s[t.name]) for t in watched_topics()]
     table += [("\nprocess      CPU, memory, slope after the warm-up", [])]
     table += [judge_process(name, cpu[name], times, memory[name]) for name in BUDGET]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
 
 import psutil
 import pytest
@@ -46,10 +45,9 @@ def test_a_mailbox_refuses_and_counts_them_all(topic: Topic[Message]) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_live_service_refuses_and_counts_them_all(
-    config: Config,
-    link: Link,
-    start: Start,
-    tmp_path: Path,
+    config: Config,  # noqa: F811
+    link: Link,  # noqa: F811
+    start: Start,  # noqa: F811
 ) -> None:
     """Over Zenoh, to a process: the next few hundred follow when it has counted the last; it steps on all the while."""
     process = start(str(FAKES), "mission")
