@@ -6,7 +6,8 @@
 #   make test        the default test suite            make test-slow   the long tests too
 #   make worlds      missions through the nine regression worlds, one for each complaint
 #   make bench       the short form of every bench: figures printed, minutes; BENCHES="qmdp lcp-speed" for some
-#   make faults      kill -9 of every service, five times each, in missions that go on; minutes, figures printed
+#   make faults      the fault suite, long tests too, then kill -9 of every service at 20 random phases; an hour
+#   make soak        ten minutes of the whole live system: rates, CPU and memory against their budgets
 #   make pictures    the README's pictures and animations: missions in lock-step, minutes; PICTURES="cave" for some
 #   make lint        ruff, mypy, import-linter         make format      let ruff rewrite the files
 #   make check       env, lint and test in a clean copy of the tree: what CI runs
@@ -35,7 +36,7 @@ export UV_LINK_MODE ?= copy
 # Third-party maps and recordings, which the tests that need them skip visibly without.
 export PLGRIM_DATA_DIR ?= $(abspath ../shared/data)
 
-.PHONY: help venv env demo test test-slow worlds bench faults pictures lint format check lock clean
+.PHONY: help venv env demo test test-slow worlds bench faults soak pictures lint format check lock clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -77,10 +78,16 @@ BENCHES ?=
 bench: env
 	@$(BIN)/python -m tests.bench $(BENCHES)
 
-# FAULTS_ARGS="--times 1 --services irm sim --speed 1" for less.
-FAULTS_ARGS ?=
+# Timed: for a machine with nothing else to do. FAULTS_ARGS="--times 1 --services irm sim" for less.
+FAULTS_ARGS ?= --times 20 --speed 1
 faults: env
-	@$(BIN)/python -m tests.faults.kill $(FAULTS_ARGS)
+	@$(BIN)/python -m pytest -s tests/faults --deselect tests/faults/test_kill.py::test_every_service_killed_five_times_at_random $(PYTEST_ARGS)
+	$(BIN)/python -m tests.faults.kill $(FAULTS_ARGS)
+
+# SOAK_ARGS="--minutes 2" for less.
+SOAK_ARGS ?= --minutes 10
+soak: env
+	@$(BIN)/python -m tests.faults.soak $(SOAK_ARGS)
 
 PICTURES ?=
 pictures: env

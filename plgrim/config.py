@@ -58,8 +58,9 @@ class ClockConfig(_Section):
 
     speed: float = Field(1.0, gt=0, le=100)
     """Mission seconds a wall second. Above what the machine can compute, planners fall behind."""
-    origin_ns: int = Field(0, ge=0)
-    """Reading of `source` at mission clock 0, ns."""
+    origin_ns: int = 0
+    """Reading of `source` at mission clock 0, ns. Negative where a mission goes on after a reboot, in which
+    CLOCK_MONOTONIC has begun anew."""
     source: Literal["monotonic", "realtime"] = "monotonic"
     """monotonic: one host, shared by its processes and containers. realtime: several hosts with synchronised clocks."""
 
@@ -75,9 +76,20 @@ class RuntimeConfig(_Section):
     router_timeout_s: float = Field(30.0, gt=0)
     """How long a service started by itself waits for a router."""
     unresponsive_after_s: float = Field(15.0, gt=0)
-    """A service without a sign of health for so long is killed and restarted."""
+    """A service of whose health nothing is heard for so long, while its process lives, is killed and restarted."""
+    silent_after_s: float = Field(2.5, gt=0)
+    """A process that steps and whose heartbeat stops for so long (stopped, or locked up) is killed and restarted.
+    Several times `health_period_s`."""
+    stuck_after_s: float = Field(10.0, gt=0)
+    """A service whose step does not end for so long is killed and restarted. It is flagged as late, and not ready,
+    after 2.5 of its periods."""
+    hold_failed_s: float = Field(0.0, ge=0)
+    """A service that has used up its restarts is FAILED, and the robot holds: end the run after so long. 0: never,
+    until somebody does; `explore` and `demo` take 10 s then."""
+    spare: bool = True
+    """Keep one process warm (about 300 MB) that becomes the next service that dies: back in a second, not several."""
     restarts: int = Field(5, ge=0)
-    """Restarts of one service allowed within `restart_window_s`; one more ends the run."""
+    """Restarts of one service allowed within `restart_window_s`; after one more it is FAILED."""
     restart_window_s: float = Field(120.0, gt=0)
     backoff_s: float = Field(0.5, ge=0)
     """Wait before a restart of what failed soon after its start; doubles with each further failure in a row."""

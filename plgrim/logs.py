@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import time
+from collections import Counter
 from typing import Any
 
 import structlog
@@ -32,6 +34,24 @@ def configure_logs(service: str = "", level: int = logging.INFO) -> None:
     )
     if service:
         structlog.contextvars.bind_contextvars(service=service)
+
+
+class Seldom:
+    """Lets one line of a kind through, and the next after `pause_s`: strangers must not fill the disk with refusals."""
+
+    def __init__(self, pause_s: float = 10.0) -> None:
+        self._pause_s = pause_s
+        self._due_s: dict[str, float] = {}
+        self._since: Counter[str] = Counter()
+
+    def more(self, kind: str) -> int | None:
+        """How many of a kind there were since the last line, when it is time for one; else None. Few kinds, please."""
+        self._since[kind] += 1
+        now = time.monotonic()
+        if now < self._due_s.get(kind, 0.0):
+            return None
+        self._due_s[kind] = now + self._pause_s
+        return self._since.pop(kind)
 
 
 def get_logger() -> Any:

@@ -78,16 +78,18 @@ def run_live(
     until_end: bool = True,
     services: tuple[str, ...] = SERVICES,
     command: Command = plgrim_command,
+    resume: bool = False,
 ) -> Result:
     """Run all services as processes until the mission ends or `stop`; write and give the result.
 
-    until_end: False goes on after the mission's end. Raises PlgrimError when the services cannot run.
+    until_end: False goes on after the mission's end. resume: with the state that the configuration names.
+    Raises PlgrimError when the services cannot run.
     """
     recorder = MissionRecorder(config.seed, world_name(config), "live", config.clock.speed)
     out_dir.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
     with (
-        Supervisor(config, out_dir, services, command) as supervisor,
+        Supervisor(config, out_dir, services, command, resume) as supervisor,
         MissionProgress(recorder, status_page(config), console) as progress,
     ):
         link = supervisor.start()

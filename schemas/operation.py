@@ -81,10 +81,12 @@ class MissionCommand(Message):
 class StageHealth(Message):
     """How a service is: published by its driver, not by the stage.
 
-    dropped: refused messages by reason. waiting_for: inputs without which it does nothing useful.
+    dropped: refused messages by reason. waiting_for: inputs without which it does nothing useful. degraded: what it
+    goes on without, as a disk that takes no journal; empty when all is well.
     """
 
     schema_name: ClassVar[str] = "stage_health"
+    schema_version: ClassVar[int] = 2
 
     service: str
     ready: bool
@@ -98,6 +100,24 @@ class StageHealth(Message):
     last_error: str
     dropped: dict[str, int]
     waiting_for: list[str]
+    degraded: str = Field("", max_length=500)
+
+
+class SupervisorReport(Message):
+    """How the services are kept alive.
+
+    failed: services that are not started any more, and why. starting: those that are not ready. late: those that live
+    but have made no step for 2.5 of their periods. restarts: of each that was restarted. degraded: what services go
+    on without.
+    """
+
+    schema_name: ClassVar[str] = "supervisor_report"
+
+    failed: dict[str, str]
+    starting: list[str]
+    late: list[str]
+    restarts: dict[str, int]
+    degraded: dict[str, str]
 
 
 class LinkReport(Message):

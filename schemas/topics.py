@@ -6,7 +6,15 @@ from typing import Any
 
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Topic
-from schemas.operation import JudgeReport, LinkReport, MissionCommand, MissionState, StageHealth, WorldPicture
+from schemas.operation import (
+    JudgeReport,
+    LinkReport,
+    MissionCommand,
+    MissionState,
+    StageHealth,
+    SupervisorReport,
+    WorldPicture,
+)
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPolicy, Plan
 from schemas.recording import StageSnapshot, StepRecord
 from schemas.sensing import CoverageScan, FollowerState, Odometry, PointCloud, PoseGraph, ReadyGrid
@@ -25,6 +33,9 @@ SERVICES = ("riskmap", "irm", "gcp", "lcp", "reconciler", "mission", "status", "
 
 LINK = "link"
 """The process on the robot that holds the connection to the base station; it exists only where there is one."""
+
+WRITERS = (*SERVICES, LINK, "supervisor")
+"""Who may write: the services, the link, and what starts them."""
 
 MAY_RUN_AT_BASE = ("irm", "lcp", "gcp")
 """Stages of which one instance may run at the base and another one, the standby, on the robot."""
@@ -160,10 +171,15 @@ LINK_REPORT: Topic[LinkReport] = _topic(
     stale_ms=5000, max_bytes=64 * _KIB, link=True,
 )  # fmt: skip
 
+SUPERVISOR: Topic[SupervisorReport] = _topic(
+    SupervisorReport, "supervisor/report", "reconciler status", "which services have failed, are late or degraded",
+    period_ms=1000, max_bytes=64 * _KIB, link=True,
+)  # fmt: skip
+
 TOPICS: tuple[Topic[Message], ...] = (
     CLOUD, READY_GRID, ODOMETRY, POSE_GRAPH, COVERAGE_SCAN, FOLLOWER, JUDGE, WORLD_PICTURE, RISK_MAP, MOVING, LOCAL_IRM,
     GLOBAL_IRM, COVERAGE, COVERAGE_WINDOW, GLOBAL_POLICY, GCP_GRAPH_REQUEST, MISSION_GRAPH_REQUEST,
-    STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, MISSION, COMMAND, LINK_REPORT,
+    STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, MISSION, COMMAND, LINK_REPORT, SUPERVISOR,
 )  # fmt: skip
 """All topics of the stages. Health topics come on top: `health_topic`."""
 

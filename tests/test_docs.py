@@ -44,7 +44,7 @@ def code_lines(text: str) -> list[str]:
 def commands() -> dict[str, set[str]]:
     """The options of each command of the program; a group of commands has those of all its commands."""
     group: Any = typer.main.get_command(application)  # of typer's own copy of click
-    return {name: options(command) for name, command in group.commands.items()}
+    return {name: options(command) for name, command in group.commands.items() if not command.hidden}
 
 
 def options(command: Any) -> set[str]:

@@ -1,4 +1,4 @@
-"""`plgrim demo`, `explore`, `up`, `watch`: whole missions."""
+"""`plgrim demo`, `explore`, `up`, `resume`, `watch`: whole missions."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from plgrim.commands.options import (
 if TYPE_CHECKING:
     from plgrim.config import Config
 
+_HOLD_FAILED_S = 10.0
+"""A simulated mission need not be held for ever when a service has FAILED."""
 _DEMO_WORLD = "short_lava_tube"
 
 
@@ -77,7 +79,17 @@ def up(
     """Start the router and all services as configured, and watch over them until the mission's end or Ctrl-C."""
     overrides: dict[str, Any] = {}
     put(overrides, "clock.speed", speed)
-    _live(prepare(config_file, overrides), out, until_end=not keep)
+    _live(prepare(config_file, overrides), out, until_end=not keep, hold_failed_s=0.0)
+
+
+def resume(
+    folder: Annotated[Path, typer.Argument(help="Result folder of a run that was cut off.")],
+    keep: Annotated[bool, typer.Option("--keep", help="Go on after the mission's end.")] = False,
+) -> None:
+    """Go on with a mission of which everything died (a power cut), from the journals in its folder."""
+    from plgrim.runtime.run_folder import with_kept_state
+
+    _live(with_kept_state(folder), folder, until_end=not keep, resume=True)
 
 
 def watch(out: OutFolder = Path("out/watch"), config_file: ConfigFile = None) -> None:
@@ -112,7 +124,14 @@ def _console() -> Any:
     return Console()
 
 
-def _live(config: Config, out: Path, until_end: bool = True, peer_tour: bool = False) -> None:
+def _live(
+    config: Config,
+    out: Path,
+    until_end: bool = True,
+    peer_tour: bool = False,
+    hold_failed_s: float = _HOLD_FAILED_S,
+    resume: bool = False,
+) -> None:
     import time
 
     from plgrim.logs import configure_logs
@@ -122,6 +141,9 @@ def _live(config: Config, out: Path, until_end: bool = True, peer_tour: bool = F
 
     die_with_parent()
     configure_logs("plgrim")
+    if until_end and not config.runtime.hold_failed_s:
+        runtime = config.runtime.model_copy(update={"hold_failed_s": hold_failed_s})
+        config = config.model_copy(update={"runtime": runtime})
     check_port_free(
         *status_address(config), "choose another for the status page with PLGRIM_STATUS__PORT, or status.port"
     )
@@ -129,7 +151,7 @@ def _live(config: Config, out: Path, until_end: bool = True, peer_tour: bool = F
         clock = config.clock.model_copy(update={"origin_ns": time.monotonic_ns()})
         config = config.model_copy(update={"clock": clock})
     with stop_on_signals() as stop:
-        result = run_live(config, out, stop, _console(), until_end)
+        result = run_live(config, out, stop, _console(), until_end, resume=resume)
     _finish(_beside_tour(config, result, out) if peer_tour else result, out)
 
 
@@ -174,5 +196,5 @@ def _finish(result: dict[str, Any], out: Path) -> None:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    for command in (demo, explore, up, watch):
+    for command in (demo, explore, up, resume, watch):
         app.command()(command)

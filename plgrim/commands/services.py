@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -16,25 +18,50 @@ def run(
     config_file: ConfigFile = None,
 ) -> None:
     """Run one service in this process until Ctrl-C."""
-    from plgrim.config import load_config
-    from plgrim.logs import configure_logs
     from plgrim.registry import STAGES
     from plgrim.runtime.process import die_with_parent, stop_on_signals
 
     die_with_parent()
     if service not in (*STAGES, "status"):
         raise typer.BadParameter(f"no service {service!r}; there are {', '.join((*STAGES, 'status'))}")
+    with stop_on_signals() as stop:
+        _run(service, config_file, stop)
+    _leave()
+
+
+def _run(service: str, config_file: Path | None, stop: threading.Event) -> None:
+    from plgrim.config import load_config
+    from plgrim.logs import configure_logs
+
     configure_logs(service)
     config = load_config(config_file)
+    if service == "status":
+        from plgrim.runtime.status_service import run_status
+
+        run_status(config, stop)
+    else:
+        from plgrim.runtime.live import run_stage
+
+        run_stage(service, config, stop)
+
+
+def spare() -> None:
+    """Be the supervisor's spare: load everything, then wait to be told which service to become."""
+    from plgrim.logs import configure_logs
+    from plgrim.runtime.process import Interrupted, die_with_parent, interruptible, stop_on_signals
+    from plgrim.runtime.spare import wait_for_order, warm_up
+
+    die_with_parent()
+    configure_logs("spare")
     with stop_on_signals() as stop:
-        if service == "status":
-            from plgrim.runtime.status_service import run_status
-
-            run_status(config, stop)
-        else:
-            from plgrim.runtime.live import run_stage
-
-            run_stage(service, config, stop)
+        try:
+            with interruptible(stop):
+                warm_up()
+        except Interrupted:
+            _leave()
+        service = wait_for_order(stop)
+        if service is not None:
+            _run(service, None, stop)
     _leave()
 
 
@@ -71,3 +98,4 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
     app.command()(run)
     app.command()(router)
+    app.command(hidden=True)(spare)

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field
 
 import psutil
 
+from plgrim.runtime.pulse import Pulse
+from plgrim.runtime.watch import FLAG_PERIODS
 from plgrim.runtime.zenoh_session import Link
 from schemas.codec import decode
 from schemas.contract import Stamp
@@ -21,6 +23,8 @@ from schemas.operation import StageHealth
 from schemas.topics import health_topic
 
 _WINDOW = 512
+_SHORTEST_STUCK_S = 1.0
+"""The supervisor flags what is late by its pulse; in health, heard twice a second, only more than this counts."""
 _MIB = 1024 * 1024
 
 
@@ -46,11 +50,14 @@ def quantile(values: list[float], share: float) -> float:
 class HealthMonitor:
     """Counts what the driver reports. Safe to read from another thread.
 
-    stuck_after_s: a step that has run so long (wall) makes the service not ready.
+    stuck_after_s: a step that has run so long (wall) makes the service not ready; `expect` sets it. degraded: what the
+    service goes on without.
     """
 
     service: str
     stuck_after_s: float = 10.0
+    degraded: str = ""
+    pulse: Pulse = field(default_factory=lambda: Pulse(None))
     ready: bool = False
     errors: int = 0
     last_error: str = ""
@@ -61,6 +68,11 @@ class HealthMonitor:
     _began: float | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _process: psutil.Process = field(default_factory=psutil.Process)
+
+    def expect(self, period_s: float) -> None:
+        """From now on a step ends at least once in `period_s` wall seconds; the first may take what it needs."""
+        self.stuck_after_s = max(_SHORTEST_STUCK_S, FLAG_PERIODS * period_s)
+        self.pulse.expect(period_s)
 
     def step_began(self) -> None:
         """A step starts now."""
@@ -74,6 +86,7 @@ class HealthMonitor:
             self._seconds.append(ended - (self._began or ended))
             self._ended.append(ended)
             self._began = None
+        self.pulse.stepped()
 
     def failed(self, error: BaseException) -> None:
         """Count an error of the stage."""
@@ -84,7 +97,7 @@ class HealthMonitor:
         """The message. dropped, waiting_for: what the mailbox knows."""
         with self._lock:
             seconds, ended, began = list(self._seconds), list(self._ended), self._began
-        stuck = began is not None and time.monotonic() - began > self.stuck_after_s
+        stuck = bool(began and self.steps and time.monotonic() - began > self.stuck_after_s)
         return StageHealth(
             stamp_ns=now,
             service=self.service,
@@ -99,6 +112,7 @@ class HealthMonitor:
             last_error="a step does not end" if stuck else self.last_error,
             dropped={**dropped, **self.dropped},
             waiting_for=waiting_for,
+            degraded=self.degraded[:500],
         )
 
 

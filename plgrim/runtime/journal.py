@@ -11,8 +11,11 @@ was, never a mixture.
 from __future__ import annotations
 
 import contextlib
+import os
+import shutil
 import sqlite3
 import struct
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +23,7 @@ from pathlib import Path
 import xxhash
 
 from plgrim.errors import JournalError
+from plgrim.runtime.durable import make_folder
 
 _FORMAT = 1
 _SLOTS = ("a", "b")
@@ -84,7 +88,7 @@ class Journal:
         self._writing = False
         self.damage: list[str] = []
         with _clear_errors(folder):
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
 
     def recover(self) -> list[Recovered]:
         """The states there are, the newest first: at most one from each file's snapshot. Empty without any.
@@ -119,11 +123,29 @@ class Journal:
         path = self._paths[index]
         if not path.exists():
             return None
+        found = len(self.damage)
         try:
             with contextlib.closing(self._connect(path)) as connection:
                 return self._read_slot(connection, path.name)
         except _UNREADABLE as error:
             self.damage.append(f"{path.name}: {error}")
+        copied = self._read_copy(path)
+        if copied is not None and copied.snapshot is not None:
+            del self.damage[found]  # nothing is wrong but that SQLite cannot write beside it
+        return copied
+
+    def _read_copy(self, path: Path) -> _Slot | None:
+        """As `_read`, from a copy in memory: SQLite reads no log without writing, which a full disk does not allow."""
+        place = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+        try:
+            with tempfile.TemporaryDirectory(dir=place) as folder:
+                for suffix in ("", "-wal"):
+                    file = path.with_name(path.name + suffix)
+                    if file.exists():
+                        shutil.copyfile(file, Path(folder) / file.name)
+                with contextlib.closing(self._connect(Path(folder) / path.name)) as connection:
+                    return self._read_slot(connection, path.name)
+        except _UNREADABLE:
             return None
 
     def _read_slot(self, connection: sqlite3.Connection, name: str) -> _Slot | None:

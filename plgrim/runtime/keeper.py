@@ -6,7 +6,7 @@ taken between steps, never inside one.
 
 from __future__ import annotations
 
-import os
+import contextlib
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +15,9 @@ from typing import Protocol, TypeVar
 from plgrim.config import RuntimeConfig
 from plgrim.errors import JournalError
 from plgrim.logs import get_logger
+from plgrim.runtime.durable import write_whole
 from plgrim.runtime.journal import Journal, Recovered
+from plgrim.runtime.lock import Lock
 from schemas.contract import SECOND_NS, Journaling, Outputs, Resuming, Stamp
 
 _LARGEST_SHARE = 0.02
@@ -59,6 +61,7 @@ class Keeper:
         self._due_s = 0.0
         self._tries = journal.folder / f"{journal.service}.tries"
         self._steps_to_go = 0
+        self._lock: Lock | None = None
         self.trouble = ""
         self.recovered = False
         self._log = get_logger()
@@ -68,8 +71,11 @@ class Keeper:
         """The keeper of a service, or None when no `state_dir` is configured. Raises JournalError."""
         if not config.state_dir:
             return None
-        journal = Journal(Path(config.state_dir) / robot, service, service not in _NOT_DURABLE)
-        return cls(journal, config.snapshot_period_s)
+        folder = Path(config.state_dir) / robot
+        journal = Journal(folder, service, service not in _NOT_DURABLE)
+        keeper = cls(journal, config.snapshot_period_s)
+        keeper._lock = _lock(folder, service)
+        return keeper
 
     def recover(self, make: Callable[[], _R], now: Stamp) -> _R:
         """A stage as it was when its process died; as new when there is nothing to go on from.
@@ -85,7 +91,7 @@ class Keeper:
         for state in states:
             if tries >= _TRIES:
                 self._log.error("the state is not used: no life that began with it went on", tries=tries)
-                self._tries.unlink(missing_ok=True)  # what this life comes to is a state to go on from again
+                self._forget_tries()  # what this life comes to is a state to go on from again
                 break
             if state.saved_ns > now:
                 self._log.warning("journal of another mission: not used", saved_s=state.saved_ns / SECOND_NS)
@@ -99,7 +105,9 @@ class Keeper:
             _write_number(self._tries, tries + 1)
             _tell(stage)
         self._begin(stage, now)
-        if self.trouble:
+        if (
+            self.trouble and not self.recovered
+        ):  # the user's to mend; a robot on its way goes on without a journal
             raise JournalError(self.trouble)
         return stage
 
@@ -135,9 +143,13 @@ class Keeper:
         if self._steps_to_go:
             self._steps_to_go -= 1
             if not self._steps_to_go:
-                self._tries.unlink(missing_ok=True)
+                self._forget_tries()
         if self._stopwatch() >= self._due_s:
             self._begin(stage, now)
+
+    def _forget_tries(self) -> None:
+        with contextlib.suppress(OSError):  # of a read-only disk, on which they could not be written either
+            self._tries.unlink(missing_ok=True)
 
     def _begin(self, stage: Restorable, now: Stamp) -> None:
         began = self._stopwatch()
@@ -161,6 +173,19 @@ class Keeper:
         if stage is not None:
             self._begin(stage, now)
         self._journal.close()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+
+def _lock(folder: Path, service: str) -> Lock | None:
+    """The journal is this process's alone. Raises AlreadyRunningError; a disk that takes no lock file is no reason."""
+    mend = "stop it first, or give this one a folder of its own with runtime.state_dir"
+    try:
+        return Lock(folder / f"{service}.lock", f"another {service} writes this journal", mend)
+    except OSError as error:
+        get_logger().warning("journal not locked", reason=str(error))
+        return None
 
 
 def _tell(stage: object) -> None:
@@ -191,10 +216,7 @@ def _read_number(path: Path) -> int:
 
 def _write_number(path: Path, number: int) -> None:
     """Write a small file whole or not at all; a failure is logged, for nothing hangs on it alone."""
-    fresh = path.with_suffix(f"{path.suffix}.{os.getpid()}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        fresh.write_text(str(number), encoding="ascii")
-        fresh.replace(path)
+        write_whole(path, str(number))
     except OSError as error:
         get_logger().warning("not written", file=str(path), error=str(error))

@@ -13,7 +13,7 @@ import zenoh
 
 from plgrim.config import Config, check_service
 from plgrim.errors import ServiceFailedError
-from plgrim.logs import get_logger
+from plgrim.logs import Seldom, get_logger
 from plgrim.registry import stage_module, world_errors
 from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.mailbox import Mailbox, Outbox
@@ -105,6 +105,7 @@ class LiveDriver:
         self._triggered = False
         self._triggers = frozenset(spec.triggers)
         self._errors_in_a_row = 0
+        self._refusals = Seldom()
         self._log = get_logger()
 
     def run(self, stop: threading.Event) -> None:
@@ -116,6 +117,8 @@ class LiveDriver:
             self._service.link.subscribe(topic, self._accept)
         self._service.mailbox_report = self._mailbox_report
         self._service.knows = self._knows
+        self._service.monitor.pulse.listen_to_numba()
+        self._service.monitor.expect(self._clock.wall_seconds(self._spec.period_ns))
         self._service.monitor.ready = True
         self._log.info("ready", period_ms=self._spec.period_ns / 1e6, topics=len(self._mailbox.topics))
         try:
@@ -147,8 +150,8 @@ class LiveDriver:
             if accepted and topic.name in self._triggers:
                 self._triggered = True
                 self._wake.notify()
-        if refusal:
-            self._log.warning("message refused", reason=refusal)
+        if refusal and (more := self._refusals.more(topic.name)):
+            self._log.warning("message refused", reason=refusal, times=more)
 
     def _wait(self, due: Stamp, stop: threading.Event) -> bool:
         """Wait until `due` or a trigger; True for a trigger. Short waits, since a signal only sets `stop`."""
@@ -178,6 +181,7 @@ class LiveDriver:
             self._publish(inputs, now)
             if self._keeper is not None:
                 self._keeper.after_step(self._stage, now)
+                monitor.degraded = self._keeper.trouble
             self._errors_in_a_row = 0
         except Exception as error:
             trouble = error_text(error)

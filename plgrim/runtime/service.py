@@ -17,6 +17,7 @@ from plgrim.runtime.clock import MissionClock
 from plgrim.runtime.health import HealthMonitor, Heartbeat, query_key, token_key
 from plgrim.runtime.keeper import next_epoch
 from plgrim.runtime.mailbox import Outbox
+from plgrim.runtime.pulse import Pulse
 from plgrim.runtime.zenoh_session import Link, connect
 from schemas.contract import Output, Stamp
 from schemas.operation import StageHealth
@@ -39,7 +40,7 @@ class LiveService:
         self.config = config
         self.clock = MissionClock.of(config.clock)
         self.epoch = next_epoch(config.runtime, config.robot, name, time.time_ns() // 1_000_000)
-        self.monitor = monitor or HealthMonitor(name)
+        self.monitor = monitor or HealthMonitor(name, pulse=Pulse.of_environment())
         self.mailbox_report: Callable[[Stamp], tuple[dict[str, int], list[str]]] = lambda _: ({}, [])
         self.knows: Callable[[], dict[str, tuple[int, int]]] = dict
         self.link: Link = connect(config.router, config.robot, stop, config.runtime.router_timeout_s)
@@ -65,20 +66,32 @@ class LiveService:
         self.link.close()
 
     def _refuse_second_instance(self) -> None:
-        """Declare a token, then look for older ones: of two that start together the older one stays."""
+        """Look for another one before and after declaring a token.
+
+        Whoever finds one that was there first gives way; of two that start at the same moment the smaller key stays.
+        No clock decides this: one that was set back must not make the newcomer the older one.
+        """
         robot = self.config.robot
-        mine = token_key(robot, self._path, f"{time.time_ns():020d}-{os.getpid()}")
-        self.link.token(mine)
+        everyone = token_key(robot, self._path, "*")
         for attempt in range(2):  # the token of a process that was just killed may live for a moment
-            others = [key for key in self.link.tokens(token_key(robot, self._path, "*")) if key < mine]
+            others = self.link.tokens(everyone)
             if not others:
-                return
+                break
             if attempt == 0:
                 time.sleep(0.5)
-        pid = others[0].rpartition("-")[2]
-        raise AlreadyRunningError(
-            f"{self.name} of robot {robot!r} is already running (process {pid}) at this router: stop it first, "
-            "or give this one another robot name with PLGRIM_ROBOT"
+        else:
+            raise self._already_running(others[0])
+        mine = token_key(robot, self._path, f"{time.time_ns():020d}-{os.getpid()}")
+        self.link.token(mine)
+        earlier = [key for key in self.link.tokens(everyone) if key < mine]
+        if earlier:
+            raise self._already_running(earlier[0])
+
+    def _already_running(self, key: str) -> AlreadyRunningError:
+        pid = key.rpartition("-")[2]
+        return AlreadyRunningError(
+            f"{self.name} of robot {self.config.robot!r} is already running (process {pid}) at this router: stop it "
+            "first, or give this one another robot name with PLGRIM_ROBOT"
         )
 
     def health(self) -> StageHealth:
@@ -88,6 +101,7 @@ class LiveService:
         return self.monitor.report(now, dropped, waiting_for)
 
     def _beat(self) -> None:
+        self.monitor.pulse.beat()
         topic = health_topic(self.name)
         try:
             self._last = self._outbox.pack(Output(topic, self.health()), self.clock.now_ns(), self.knows())

@@ -7,7 +7,7 @@ from typing import cast
 
 from plgrim.config import Config, check_service
 from plgrim.errors import PortTakenError
-from plgrim.logs import get_logger
+from plgrim.logs import Seldom, get_logger
 from plgrim.runtime.clock import MissionClock
 from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.mailbox import Mailbox, Outbox
@@ -30,13 +30,15 @@ class StatusFeed:
         self._shared = shared
         self._clock = clock
         self._lock = threading.Lock()
+        self._refusals = Seldom()
 
     def accept(self, topic: Topic[Message], payload: bytes) -> None:
         """One payload; called from the thread of its subscription."""
         now = self._clock.now_ns()
         with self._lock:
             if not self._mailbox.accept(topic, payload, now):
-                get_logger().warning("message refused", reason=self._mailbox.last_refusal)
+                if more := self._refusals.more(topic.name):
+                    get_logger().warning("message refused", reason=self._mailbox.last_refusal, times=more)
                 return
             received = self._mailbox.inputs(now).new(topic)
             self._mailbox.stepped()
@@ -80,6 +82,7 @@ def _serve(
         service.link.subscribe(topic, feed.accept)
     service.mailbox_report = feed.report
     server.start()
+    service.monitor.expect(_TICK_S)
     service.monitor.ready = True
     get_logger().info("ready", page=page_address(server.shared.config.host, server.port))
     while not stop.wait(_TICK_S):
@@ -91,6 +94,7 @@ def _serve(
             service.link.publish(STATUS_GRAPH_REQUEST, payload)
         if keeper is not None:
             keeper.after_step(server.shared, now)
+            service.monitor.degraded = keeper.trouble
         service.monitor.step_ended()
     if keeper is not None:
         keeper.close(server.shared, service.clock.now_ns())

@@ -1,28 +1,42 @@
 """Starts the router and the services as processes, restarts what crashes, and ends all of it in order.
 
 Children are new processes (never forks: Zenoh does not survive one) in sessions of their own, so that Ctrl-C reaches
-the supervisor alone; the kernel kills them when the supervisor dies. Each writes its log into the run folder.
+the supervisor alone; the kernel kills them when the supervisor dies. Each writes its log into the run folder. A stage
+that lives but makes no steps is flagged by its pulse, then killed and replaced; one that cannot be kept alive is
+FAILED, and the reconciler, which hears of it, holds the robot.
 """
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
-from plgrim.config import Config, environment_overrides, write_config
+from plgrim.config import Config, write_config
 from plgrim.errors import FATAL_EXIT_CODES, PlgrimError, ServiceFailedError
 from plgrim.logs import get_logger
-from plgrim.runtime.process import child_environment
+from plgrim.runtime.children import (
+    ROUTER,
+    Child,
+    Command,
+    end,
+    environment_of,
+    new_pulse,
+    plgrim_command,
+    signal_group,
+    spawn,
+)
+from plgrim.runtime.clock import MissionClock
+from plgrim.runtime.pulse import VARIABLE
+from plgrim.runtime.reporter import Reporter
 from plgrim.runtime.router import check_endpoint_free
+from plgrim.runtime.run_folder import ClockFile, lock_run_folder, with_fresh_state
+from plgrim.runtime.spare import Spare
+from plgrim.runtime.watch import Watch
 from plgrim.runtime.zenoh_session import Link, connect
 from schemas.base import Message
 from schemas.codec import decode
@@ -31,68 +45,15 @@ from schemas.errors import MessageError
 from schemas.operation import StageHealth
 from schemas.topics import LINK, SERVICES, health_topic
 
-ROUTER = "router"
-Command = Callable[[str], list[str]]
-
-
-def plgrim_command(service: str) -> list[str]:
-    """The command line of a child."""
-    return [sys.executable, "-m", "plgrim", *([service] if service in (ROUTER, LINK) else ["run", service])]
-
-
-@dataclass(slots=True)
-class Child:
-    """One process: how it is, and when it was restarted (monotonic seconds).
-
-    failures: ends in a row of which each came soon after the start. ready_s: since when this very process is ready.
-    """
-
-    name: str
-    log: Path
-    process: subprocess.Popen[bytes] | None = None
-    started_s: float = 0.0
-    restart_at_s: float | None = None
-    restarts: deque[float] = field(default_factory=deque)
-    restarted: int = 0
-    failures: int = 0
-    health: StageHealth | None = None
-    heard_s: float = 0.0
-    ready_s: float | None = None
-
-    @property
-    def ready(self) -> bool:
-        """Whether this very process has said that it is ready."""
-        return bool(
-            self.process and self.health and self.health.ready and self.health.pid == self.process.pid
-        )
-
-    def tail(self, lines: int = 12) -> str:
-        """The last lines of its log."""
-        try:
-            return "\n".join(self.log.read_text(encoding="utf-8", errors="replace").splitlines()[-lines:])
-        except OSError:
-            return ""
-
-
-def with_fresh_state(config: Config, run_folder: Path) -> Config:
-    """The configuration with an empty folder for the journals of this run: a new mission knows nothing of the last.
-
-    `state` in the run folder, which is emptied; where the user names a folder, a new one inside.
-    """
-    if config.runtime.state_dir:
-        state = Path(config.runtime.state_dir) / f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}"
-    else:
-        state = run_folder / "state"
-        shutil.rmtree(state, ignore_errors=True)
-    runtime = config.runtime.model_copy(update={"state_dir": str(state.resolve())})
-    return config.model_copy(update={"runtime": runtime})
+__all__ = ["ROUTER", "Child", "Command", "Supervisor", "plgrim_command", "with_fresh_state"]
 
 
 class Supervisor:
     """Runs the router and services; a context manager that ends them all, whatever happens.
 
     run_folder: gets `config.yaml` (what the children read), `logs/`, and `state/` (their journals, kept only when the
-    run fails). Call `poll` often; it raises ServiceFailedError when a service cannot be kept alive.
+    run fails). resume: go on with the state that the configuration names. Call `poll` often. Raises AlreadyRunningError
+    when another supervisor is at work in the folder.
     """
 
     def __init__(
@@ -101,18 +62,28 @@ class Supervisor:
         run_folder: Path,
         services: tuple[str, ...] = SERVICES,
         command: Command = plgrim_command,
+        resume: bool = False,
     ) -> None:
-        self.config = with_fresh_state(config, run_folder)
+        self._lock_file = lock_run_folder(run_folder)  # before anything of another run is emptied
+        self.config = config if resume else with_fresh_state(config, run_folder)
         self._folder = run_folder
         self._command = command
         self._log = get_logger()
         self._lock = threading.Lock()
+        self._all_were_ready = False
         self.link: Link | None = None
         logs = run_folder / "logs"
         logs.mkdir(parents=True, exist_ok=True)
         self.children = {name: Child(name, logs / f"{name}.log") for name in (ROUTER, *services)}
         for child in self.children.values():
             child.log.unlink(missing_ok=True)
+        self.watch = Watch(run_folder / "pulse", services)
+        self._clock_file = ClockFile(Path(self.config.runtime.state_dir))
+        self._clock = MissionClock.of(self.config.clock)
+        environment = environment_of(run_folder / "config.yaml", None)
+        with_spare = self.config.runtime.spare and command is plgrim_command
+        self._spare = Spare(command, logs, environment) if with_spare else None
+        self._reporter: Reporter | None = None
 
     def __enter__(self) -> Supervisor:
         return self
@@ -121,6 +92,7 @@ class Supervisor:
         self.shutdown()
         if kind is None:
             shutil.rmtree(self.config.runtime.state_dir, ignore_errors=True)
+        self._lock_file.close()
 
     def start(self) -> Link:
         """Start the router, connect to it, start the services. Raises PortTakenError, NoRouterError."""
@@ -132,10 +104,12 @@ class Supervisor:
         except PlgrimError:
             self._check_fatal(self.children[ROUTER])
             raise
+        self._reporter = Reporter(self.link, self.config)
         for child in self._services():
             instance = self.config.link.instance(child.name)
             self.link.subscribe(health_topic(child.name), self._hear, instance=instance)
             self._spawn(child)
+        self.watch.start()
         return self.link
 
     def _services(self) -> list[Child]:
@@ -155,6 +129,7 @@ class Supervisor:
             if progress is not None:
                 progress(missing)
             if not missing:
+                self._all_were_ready = True
                 return True
             if time.monotonic() > deadline:
                 raise ServiceFailedError(
@@ -164,7 +139,11 @@ class Supervisor:
         return False
 
     def poll(self) -> None:
-        """One round: restart what has ended or no longer gives a sign of health."""
+        """One round: restart what has ended, is silent or makes no steps; tell of it; warm up a spare.
+
+        Raises ServiceFailedError when the router cannot be kept alive, or a service before all were ready once, or
+        `runtime.hold_failed_s` after a service has FAILED.
+        """
         now = time.monotonic()
         for child in self.children.values():
             if child.process is None:
@@ -172,13 +151,35 @@ class Supervisor:
                     self._spawn(child)
             elif child.process.poll() is not None:
                 self._ended(child, now)
-            elif child.name != ROUTER and self._is_silent(child, now):
-                self._log.error(
-                    "no sign of health: killed", child=child.name, after_s=round(now - child.heard_s)
-                )
-                _signal_group(child.process, signal.SIGKILL)
+            elif child.name != ROUTER:
+                self._look_after(child, child.process, now)
+        self._clock_file.write(self._clock.now_ns())
+        if self._reporter is not None:
+            self._reporter.tell(self.children, self.watch.flagged())
+        if self._spare is not None and not self.waiting_for():
+            self._spare.keep()
+        self._give_up_if_held_long(now)
 
-    def _is_silent(self, child: Child, now: float) -> bool:
+    def _look_after(self, child: Child, process: subprocess.Popen[bytes], now: float) -> None:
+        why = self._sick(child, process, now)
+        if why:
+            self._log.error("killed", child=child.name, why=why)
+            signal_group(process, signal.SIGKILL)
+
+    def _sick(self, child: Child, process: subprocess.Popen[bytes], now: float) -> str:
+        """Why a child that lives must be replaced; empty when it need not."""
+        runtime = self.config.runtime
+        silent_s = self.watch.silent_s(child.name, process.pid)
+        if silent_s > runtime.silent_after_s:
+            return f"no heartbeat for {silent_s:.1f} s"
+        late_s = self.watch.late_s(child.name, process.pid)
+        if late_s > runtime.stuck_after_s:
+            return f"no step for {late_s:.1f} s"
+        if self._is_unheard(child, now):
+            return f"no word of its health for {now - child.heard_s:.0f} s"
+        return ""
+
+    def _is_unheard(self, child: Child, now: float) -> bool:
         with self._lock:
             heard = child.health is not None and child.process and child.health.pid == child.process.pid
             since = child.heard_s if heard else child.started_s
@@ -186,36 +187,35 @@ class Supervisor:
         return now - since > (limit if heard else max(limit, self.config.runtime.start_timeout_s))
 
     def _spawn(self, child: Child) -> None:
-        environment = child_environment(os.environ)
-        for variable in environment_overrides(
-            os.environ
-        ):  # they are in config.yaml, under the command line's
-            environment.pop(variable, None)
-        environment["PLGRIM_CONFIG"] = str(self._folder / "config.yaml")
+        pulse = new_pulse(self._folder / "pulse" / child.name) if child.name != ROUTER else None
         child.restart_at_s, child.ready_s = None, None
         child.started_s = time.monotonic()
-        with child.log.open("ab") as log:
-            child.process = subprocess.Popen(
-                self._command(child.name),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=environment,
-                start_new_session=True,
-            )
+        changes = {VARIABLE: str(pulse or "")}
+        taken = (
+            self._spare.take(child.name, child.log, changes) if self._spare and child.name != ROUTER else None
+        )
+        child.process = taken or spawn(
+            self._command(child.name),
+            child.log,
+            environment_of(self._folder / "config.yaml", pulse),
+            subprocess.DEVNULL,
+        )
 
     def _ended(self, child: Child, now: float) -> None:
-        self._check_fatal(child)
+        if self._check_fatal(child):
+            return
         code = child.process.returncode if child.process else None
         runtime = self.config.runtime
         child.process = None
         while child.restarts and now - child.restarts[0] > runtime.restart_window_s:
             child.restarts.popleft()
         if len(child.restarts) >= runtime.restarts:
-            raise ServiceFailedError(
+            self._fail(
+                child,
                 f"{child.name} ended with {code} after {len(child.restarts)} restarts within "
-                f"{runtime.restart_window_s:.0f} s. The end of {child.log}:\n{child.tail()}"
+                f"{runtime.restart_window_s:.0f} s. The end of {child.log}:\n{child.tail()}",
             )
+            return
         # What ran well for a while does not fail at its start: no reason to keep the robot waiting for it.
         since = child.started_s if child.name == ROUTER else child.ready_s
         stable = since is not None and now - since >= runtime.stable_after_s
@@ -226,11 +226,36 @@ class Supervisor:
         child.restart_at_s = now + wait
         self._log.warning("service ended: restarting", child=child.name, code=code, in_s=wait)
 
-    def _check_fatal(self, child: Child) -> None:
+    def _check_fatal(self, child: Child) -> bool:
+        """Whether it has ended with a fault that a restart cannot mend; it is FAILED then."""
         code = child.process.poll() if child.process else None
-        if code in FATAL_EXIT_CODES:
-            child.process = None
-            raise ServiceFailedError(f"{child.name} cannot run:\n{child.tail()}")
+        if code not in FATAL_EXIT_CODES:
+            return False
+        child.process = None
+        self._fail(child, f"{child.name} cannot run:\n{child.tail()}")
+        return True
+
+    def _fail(self, child: Child, why: str) -> None:
+        """FAILED: not started again, and the robot holds. Raises ServiceFailedError where that is no way to go on."""
+        if child.name == ROUTER or not self._all_were_ready:
+            raise ServiceFailedError(why)
+        child.failed, child.ready_s = why, time.monotonic()
+        self._log.error("FAILED: the robot holds", child=child.name, why=why)
+
+    @property
+    def spare_warm(self) -> bool:
+        """Whether the next service that dies comes back from a warm spare; True where none is kept."""
+        return self._spare is None or self._spare.warm
+
+    def failed(self) -> dict[str, str]:
+        """The services that are not started any more, and why."""
+        return {child.name: child.failed for child in self._services() if child.failed}
+
+    def _give_up_if_held_long(self, now: float) -> None:
+        limit = self.config.runtime.hold_failed_s
+        for child in self._services():
+            if child.failed and limit and child.ready_s is not None and now - child.ready_s > limit:
+                raise ServiceFailedError(child.failed)
 
     def _hear(self, topic: Topic[Message], payload: bytes) -> None:
         try:
@@ -248,33 +273,11 @@ class Supervisor:
     def shutdown(self) -> None:
         """End the services, last started first, then the router; kill what does not end in time."""
         grace = self.config.runtime.stop_timeout_s
-        _end(list(reversed(self._services())), grace)
+        self.watch.stop()
+        if self._spare is not None:
+            self._spare.close()
+        end(list(reversed(self._services())), grace)
         if self.link is not None:
             self.link.close()
             self.link = None
-        _end([self.children[ROUTER]], grace)
-
-
-def _end(children: list[Child], grace_s: float) -> None:
-    running = {child.name: child.process for child in children if child.process}
-    for process in running.values():
-        if process.poll() is None:
-            process.terminate()
-    deadline = time.monotonic() + grace_s
-    for name, process in running.items():
-        try:
-            process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            get_logger().warning("did not end in time: killed", child=name)
-        _signal_group(process, signal.SIGKILL)  # also what it may have started
-        process.wait()
-    for child in children:
-        child.process = None
-
-
-def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
-    """Signal the process group that the child leads (`start_new_session`)."""
-    try:
-        os.killpg(process.pid, number)
-    except (ProcessLookupError, PermissionError):
-        return
+        end([self.children[ROUTER]], grace)

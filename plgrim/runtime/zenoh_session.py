@@ -48,7 +48,8 @@ def session_config(router: RouterConfig, mode: str) -> dict[str, Any]:
     )
     return place | {
         "mode": mode,
-        "timestamping": {"enabled": True},
+        # No wall-clock time on the wire: nobody reads it, and one that is off by half a second is an error a message.
+        "timestamping": {"enabled": False},
         "queries_default_timeout": 1000,
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {

@@ -9,6 +9,9 @@ from schemas.policy import SafetyState
 
 _SEVERITY = [SafetyState.RUN, SafetyState.DEGRADED, SafetyState.HOLD, SafetyState.RETURN, SafetyState.DONE]
 
+_NOT_NEEDED = frozenset({"status"})
+"""Services without which the robot may move."""
+
 
 class SafetyLimits(NamedTuple):
     """Ages from which inputs are stale, s."""
@@ -22,7 +25,8 @@ class SafetyLimits(NamedTuple):
 class SafetyInputs(NamedTuple):
     """What the machine looks at: ages of inputs in seconds (None: never came), and the mission's phase.
 
-    in_the_way: somebody moves so near that the robot must stand (see `separation`).
+    in_the_way: somebody moves so near that the robot must stand (see `separation`). failed: services that the
+    supervisor could not keep alive. unsaved: services that cannot write their journals.
     """
 
     risk_age_s: float | None
@@ -31,6 +35,8 @@ class SafetyInputs(NamedTuple):
     policy_silence_s: float
     phase: MissionPhase | None
     in_the_way: bool = False
+    failed: tuple[str, ...] = ()
+    unsaved: tuple[str, ...] = ()
 
 
 class Verdict(NamedTuple):
@@ -45,16 +51,18 @@ class Verdict(NamedTuple):
 def judge(limits: SafetyLimits, inputs: SafetyInputs) -> Verdict:
     """The most severe state that any input asks for, with its reason.
 
-    DONE and HOLD stop the robot. RETURN moves, unless something also asks for a hold.
+    DONE and HOLD stop the robot. RETURN moves, unless something also asks for a hold. What cannot be journaled degrades
+    the mission, but is no reason to drive slowly.
     """
     asked = [*_stale(limits, inputs), *_mission(inputs.phase)]
+    slow = any(s == SafetyState.DEGRADED for s, _ in asked)
+    asked += _supervised(inputs)
     if inputs.in_the_way:
         asked.append((SafetyState.HOLD, "somebody moves in the way"))
     if not asked:
         return Verdict(SafetyState.RUN, "", True, False)
     state, reason = max(asked, key=lambda entry: _SEVERITY.index(entry[0]))
     stops = [r for s, r in asked if s in (SafetyState.HOLD, SafetyState.DONE)]
-    slow = any(s == SafetyState.DEGRADED for s, _ in asked)
     return Verdict(state, "; ".join(stops) if stops else reason, not stops, slow)
 
 
@@ -68,6 +76,17 @@ def _stale(limits: SafetyLimits, inputs: SafetyInputs) -> list[tuple[SafetyState
         found.append((SafetyState.DEGRADED, _text("Local IRM", inputs.irm_age_s)))
     if inputs.policy_silence_s > limits.policy_silent_s:
         found.append((SafetyState.DEGRADED, f"no answer from lcp for {inputs.policy_silence_s:.1f} s"))
+    return found
+
+
+def _supervised(inputs: SafetyInputs) -> list[tuple[SafetyState, str]]:
+    found = []
+    if needed := [name for name in inputs.failed if name not in _NOT_NEEDED]:
+        found.append((SafetyState.HOLD, f"{', '.join(needed)} failed and cannot be restarted"))
+    if rest := [name for name in inputs.failed if name in _NOT_NEEDED]:
+        found.append((SafetyState.DEGRADED, f"{', '.join(rest)} failed"))
+    if inputs.unsaved:
+        found.append((SafetyState.DEGRADED, f"{', '.join(inputs.unsaved)} cannot write their journals"))
     return found
 
 

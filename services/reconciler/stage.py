@@ -24,6 +24,7 @@ from schemas.topics import (
     ODOMETRY,
     PLAN,
     RISK_MAP,
+    SUPERVISOR,
 )
 from schemas.world import LocalIrm
 from services.reconciler.config import Config
@@ -140,7 +141,7 @@ class ReconcilerStage:
 
     def _judge(self, now: Stamp, inputs: Inputs) -> Verdict:
         c = self._config
-        mission = inputs.current(MISSION)
+        mission, report = inputs.current(MISSION), inputs.current(SUPERVISOR)
         waiting = (now - self._asked_ns) / SECOND_NS if self._asked_ns >= 0 else 0.0
         return judge(
             SafetyLimits(c.risk_stale_s, c.odometry_stale_s, c.irm_stale_s, c.policy_silent_s),
@@ -151,6 +152,8 @@ class ReconcilerStage:
                 waiting,
                 mission.phase if mission is not None else None,
                 self._guard.share <= 0.0,
+                failed=tuple(sorted(report.failed)) if report else (),
+                unsaved=tuple(sorted(report.degraded)) if report else (),
             ),
         )
 

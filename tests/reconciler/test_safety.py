@@ -75,6 +75,23 @@ def test_a_return_stops_when_something_asks_for_a_hold_and_says_so() -> None:
     assert "risk map" in verdict.reason
 
 
+@pytest.mark.parametrize("failed", ["riskmap", "irm", "gcp", "lcp", "mission", "sim"])
+def test_a_failed_stage_that_is_needed_holds(failed: str) -> None:
+    verdict = judge(LIMITS, good()._replace(failed=(failed,)))
+    assert verdict.state is HOLD
+    assert not verdict.may_move
+    assert f"{failed} failed" in verdict.reason
+    assert not judge(LIMITS, good(MissionPhase.RETURN)._replace(failed=(failed,))).may_move
+
+
+def test_a_failed_status_page_and_a_full_disk_degrade_but_do_not_slow() -> None:
+    for changed in (good()._replace(failed=("status",)), good()._replace(unsaved=("irm",))):
+        verdict = judge(LIMITS, changed)
+        assert (verdict.state, verdict.may_move, verdict.slow) == (DEGRADED, True, False)
+        assert "status" in verdict.reason or "irm cannot write" in verdict.reason
+    assert judge(LIMITS, good()._replace(unsaved=("irm",), irm_age_s=9.0)).slow
+
+
 def test_every_reason_to_stop_is_named() -> None:
     verdict = judge(LIMITS, SafetyInputs(9.0, None, None, 9.0, MissionPhase.PAUSED))
     assert not verdict.may_move

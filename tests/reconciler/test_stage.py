@@ -10,10 +10,10 @@ import pytest
 
 from schemas.codec import Envelope, encode
 from schemas.contract import SECOND_NS, Resuming, StageSetup
-from schemas.operation import MissionPhase
+from schemas.operation import MissionPhase, SupervisorReport
 from schemas.policy import EpisodeRequest, LocalPhase, Plan, SafetyState
 from schemas.snapshot import unpack_snapshot
-from schemas.topics import LOCAL_POLICY, MOVING, RISK_MAP
+from schemas.topics import LOCAL_POLICY, MOVING, RISK_MAP, SUPERVISOR
 from services.reconciler.config import Config
 from services.reconciler.stage import create, spec
 from services.reconciler.trail import Trail
@@ -549,3 +549,19 @@ def test_without_a_way_on_for_long_it_goes_back() -> None:
     assert rig.last().valid and math.cos(rig.last().yaw_rad[0] - came) > 0.5
     rig.run(4.0)
     assert math.dist(was, (rig.x_m, rig.y_m)) > 0.5
+
+
+def test_what_the_supervisor_says_holds_and_degrades() -> None:
+    rig = driving()
+    said = {"stamp_ns": rig.now, "starting": [], "late": [], "restarts": {}}
+    rig.reconciler.put(SUPERVISOR, SupervisorReport(**said, failed={}, degraded={"irm": "no space"}), rig.now)
+    rig.tick()
+    rig.tick()
+    assert (rig.last().safety, rig.last().valid) == (SafetyState.DEGRADED, True)
+    rig.reconciler.put(SUPERVISOR, SupervisorReport(**said, failed={"lcp": "ended"}, degraded={}), rig.now)
+    rig.tick()
+    assert (rig.last().safety, rig.last().valid) == (SafetyState.HOLD, False)
+    assert "lcp failed" in rig.last().reason
+    rig.reconciler.put(SUPERVISOR, SupervisorReport(**said, failed={}, degraded={}), rig.now)
+    rig.run(0.3)
+    assert rig.last().valid

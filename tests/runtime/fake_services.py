@@ -5,6 +5,7 @@ They take the names of real services, since the table of topics says who may wri
 
 from __future__ import annotations
 
+import ctypes
 import sys
 
 import numpy as np
@@ -129,6 +130,22 @@ class Failing(_Memoryless):
         raise RuntimeError("this stage always fails")
 
 
+class Astray(_Memoryless):
+    """Goes astray in its 20th step: turns for ever, or holds Python's lock and sleeps."""
+
+    def __init__(self, locked: bool) -> None:
+        self._steps = 0
+        self._locked = locked
+
+    def step(self, now: Stamp, inputs: Inputs) -> Outputs:
+        """Nothing, twenty times."""
+        self._steps += 1
+        while self._steps >= 20:
+            if self._locked:
+                ctypes.PyDLL(None).sleep(600)
+        return []
+
+
 class Idle(_Memoryless):
     """Gives nothing."""
 
@@ -141,6 +158,8 @@ def make_fake(name: str, behaviour: str) -> tuple[StageSpec, Stage]:
     """The fake for a service's name."""
     if behaviour == "failing":
         return StageSpec(name, SECOND_NS // 50), Failing()
+    if behaviour in ("loops", "locks"):
+        return StageSpec(name, SECOND_NS // 5), Astray(behaviour == "locks")
     if behaviour == "idle":
         return StageSpec(name, SECOND_NS), Idle()
     if behaviour == "exits":

@@ -184,8 +184,9 @@ def test_a_second_instance_is_not_restarted_but_told(config: Config, tmp_path: P
         first = child.process
         supervisor._spawn(child)
 
-        with pytest.raises(ServiceFailedError, match="already running"):
-            eventually(lambda: False, "the second one is refused", supervisor.poll)
+        eventually(supervisor.failed, "the second one is refused", supervisor.poll)
+        assert "already running" in supervisor.failed()["sim"]
+        assert child.restarted == 0
         child.process = first
 
 

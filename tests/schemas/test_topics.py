@@ -8,6 +8,7 @@ from schemas.topics import (
     LINK,
     SERVICES,
     TOPICS,
+    WRITERS,
     health_topic,
     read_by,
     recorder_topics,
@@ -28,7 +29,7 @@ def test_names_and_schema_names_are_unique() -> None:
 
 def test_writers_and_readers_are_services() -> None:
     for topic in ALL:
-        assert topic.writer in (*SERVICES, LINK)
+        assert topic.writer in WRITERS
         assert topic.name.split("/")[0] == topic.writer
         assert set(topic.readers) <= set(SERVICES), topic.name
         assert len(set(topic.readers)) == len(topic.readers), topic.name
