@@ -6,7 +6,18 @@ import sys
 
 import typer
 
-from plgrim.commands import doctor, evaluate, feed, foxglove, inspect, link, missions, record, report, services
+from plgrim.commands import (
+    doctor,
+    evaluate,
+    feed,
+    foxglove,
+    inspect,
+    link,
+    missions,
+    record,
+    report,
+    services,
+)
 from plgrim.commands.examples import add_examples
 from plgrim.errors import PlgrimError
 

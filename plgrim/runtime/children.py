@@ -26,7 +26,12 @@ Command = Callable[[str], list[str]]
 
 def plgrim_command(service: str) -> list[str]:
     """The command line of a child."""
-    return [sys.executable, "-m", "plgrim", *([service] if service in (ROUTER, LINK, SPARE) else ["run", service])]
+    return [
+        sys.executable,
+        "-m",
+        "plgrim",
+        *([service] if service in (ROUTER, LINK, SPARE) else ["run", service]),
+    ]
 
 
 @dataclass(slots=True)

@@ -43,7 +43,7 @@ from schemas.codec import decode
 from schemas.contract import Topic
 from schemas.errors import MessageError
 from schemas.operation import StageHealth
-from schemas.topics import LINK, SERVICES, health_topic
+from schemas.topics import SERVICES, health_topic
 
 __all__ = ["ROUTER", "Child", "Command", "Supervisor", "plgrim_command", "with_fresh_state"]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from schemas.topics import (
-    LINK,
     SERVICES,
     TOPICS,
     WRITERS,
