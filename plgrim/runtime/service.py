@@ -18,6 +18,7 @@ from plgrim.runtime.health import HealthMonitor, Heartbeat, query_key, token_key
 from plgrim.runtime.keeper import next_epoch
 from plgrim.runtime.mailbox import Outbox
 from plgrim.runtime.zenoh_session import Link, connect
+from plgrim.security.exposure import check_client
 from schemas.contract import Output, Stamp
 from schemas.operation import StageHealth
 from schemas.topics import health_topic
@@ -39,7 +40,8 @@ class LiveService:
         self.epoch = next_epoch(config.runtime, config.robot, name, time.time_ns() // 1_000_000)
         self.monitor = monitor or HealthMonitor(name)
         self.mailbox_report: Callable[[Stamp], tuple[dict[str, int], list[str]]] = lambda _: ({}, [])
-        self.link: Link = connect(config.router, config.robot, stop, config.runtime.router_timeout_s)
+        check_client(config, name)
+        self.link: Link = connect(config.router, config.robot, stop, config.runtime.router_timeout_s, name)
         self._outbox = Outbox(config.robot, name, self.epoch)
         self._last = b""
         try:

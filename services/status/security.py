@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import ipaddress
 import stat
 from dataclasses import dataclass
 from enum import IntEnum
@@ -28,6 +27,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel
 from starlette.requests import HTTPConnection
 
+from schemas.hosts import is_loopback
 from services.status.config import Config
 from services.status.guard import Guard
 
@@ -131,16 +131,6 @@ def _token(words: list[str], where: str) -> Token:
     if len(digest) != hashlib.sha256().digest_size:
         raise SecurityError(f"{where}: {_HASHED} is followed by 64 hexadecimal digits")
     return Token(Role[role], name, digest)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether a listening address can be reached from this host alone."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]").partition("%")[0]).is_loopback
-    except ValueError:
-        return False
 
 
 def check_binding(config: Config) -> None:

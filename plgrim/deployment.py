@@ -1,0 +1,45 @@
+"""Which process runs where: one description, from which `plgrim up --role`, certificates, compose files and systemd
+units are derived or against which they are checked.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from plgrim.errors import ConfigError
+from plgrim.security.access import LINK, ROUTER, TOOLS
+from schemas.topics import SERVICES
+
+Role = Literal["all", "robot", "base"]
+ROLES: tuple[Role, ...] = ("all", "robot", "base")
+USUAL_AT_BASE = ("gcp", "status")
+_STANDBYS = ("irm", "lcp", "gcp")
+
+
+def role_named(name: str) -> Role:
+    """Raises ConfigError for a role that there is not."""
+    for role in ROLES:
+        if role == name:
+            return role
+    raise ConfigError(f"no role {name!r}: there are {', '.join(ROLES)}")
+
+
+def services_of(
+    role: Role, at_base: tuple[str, ...] = USUAL_AT_BASE, simulated: bool = True
+) -> tuple[str, ...]:
+    """The services of a host. A planner that runs at the base has a standby on the robot; status has none.
+
+    simulated: False leaves out the simulator, whose topics a gateway of the robot's own then writes.
+    """
+    found = SERVICES if simulated else tuple(name for name in SERVICES if name != "sim")
+    if role == "base":
+        return tuple(name for name in found if name in at_base)
+    if role == "robot":
+        return tuple(name for name in found if name not in at_base or name in _STANDBYS)
+    return found
+
+
+def processes_of(role: Role, at_base: tuple[str, ...] = USUAL_AT_BASE) -> tuple[str, ...]:
+    """Whoever needs a certificate on a host; `sim` also stands for the gateway that writes its topics."""
+    link = (LINK,) if role == "robot" else ()
+    return (ROUTER, *services_of(role, at_base), *link, TOOLS)
