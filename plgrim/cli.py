@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from plgrim.commands import certs, evaluate, feed, inspect, missions, services
+from plgrim.commands import certs, evaluate, feed, inspect, link, missions, services
 from plgrim.errors import PlgrimError
 
 application = typer.Typer(
@@ -16,7 +16,7 @@ application = typer.Typer(
     add_completion=False,
     pretty_exceptions_show_locals=False,
 )
-for room in (missions, services, feed, evaluate, inspect, certs):
+for room in (missions, services, link, feed, evaluate, inspect, certs):
     room.register(application)
 
 

@@ -23,6 +23,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 from planning.robot_profile import PROFILES
 from plgrim.config_keys import check_env_name, check_keys, describe
 from plgrim.errors import ConfigError
+from plgrim.link.config import LinkConfig
 from plgrim.registry import STAGES
 from schemas.hosts import is_loopback
 
@@ -132,6 +133,7 @@ class Config(BaseSettings):
     clock: ClockConfig = ClockConfig()
     runtime: RuntimeConfig = RuntimeConfig()
     deployment: DeploymentConfig = DeploymentConfig()
+    link: LinkConfig = LinkConfig()
     riskmap: dict[str, Any] = Field(default_factory=dict)
     irm: dict[str, Any] = Field(default_factory=dict)
     gcp: dict[str, Any] = Field(default_factory=dict)

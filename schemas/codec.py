@@ -2,7 +2,8 @@
 
 The first ten bytes are a msgpack array of two and an unsigned 64-bit checksum (xxh3) of all that follows, so that a
 damaged message is refused before anything in it is parsed. Columns are `[dtype, shape, raw little-endian bytes]` and
-decode to read-only arrays over the received bytes.
+decode to read-only arrays over the received bytes. What came over a radio may be in the form of `schemas.compact`;
+`decode` takes both.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import xxhash
 from pydantic import BaseModel, ValidationError
 
 from schemas.base import Message, columns_of
+from schemas.compact import is_compact, restore_body
 from schemas.errors import (
     ChecksumError,
     MalformedError,
@@ -38,6 +40,7 @@ _DTYPES = frozenset(
     {"float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"}
 )
 _MAX_AXES = 4
+_PEEK_BYTES = 1024
 _M = TypeVar("_M", bound=Message)
 
 
@@ -106,6 +109,8 @@ def decode(payload: bytes, expected: type[_M], max_bytes: int) -> tuple[_M, Enve
 def _unpack(payload: bytes, max_bytes: int) -> dict[str, Any]:
     if len(payload) > max_bytes:
         raise TooLargeError(f"{len(payload)} bytes, at most {max_bytes} allowed")
+    if is_compact(payload):
+        return restore_body(payload, max_bytes)
     if len(payload) <= _PREFIX_BYTES or payload[:2] != _PREFIX:
         raise MalformedError("not a PLGRIM message")
     view = memoryview(payload)
@@ -119,6 +124,25 @@ def _unpack(payload: bytes, max_bytes: int) -> dict[str, Any]:
     if not isinstance(body, dict):
         raise MalformedError("the body is not a map")
     return body
+
+
+def peek(payload: bytes) -> tuple[int, int]:
+    """(epoch, sequence) of a message in the plain form, from its first bytes alone. Raises MalformedError.
+
+    Nothing is checked: for bookkeeping on messages that somebody else decodes.
+    """
+    unpacker = msgpack.Unpacker(raw=False, max_buffer_size=_PEEK_BYTES)
+    unpacker.feed(memoryview(payload)[_PREFIX_BYTES : _PREFIX_BYTES + _PEEK_BYTES])
+    found: dict[str, Any] = {}
+    try:
+        for _ in range(unpacker.read_map_header()):
+            name = unpacker.unpack()
+            found[name] = unpacker.unpack()
+            if name == "sequence":
+                return int(found["epoch"]), int(found["sequence"])
+    except (ValueError, TypeError, KeyError, msgpack.exceptions.UnpackException) as error:
+        raise MalformedError(f"no envelope: {error}") from error
+    raise MalformedError("no envelope")
 
 
 def _envelope(body: dict[str, Any]) -> Envelope:

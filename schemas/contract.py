@@ -39,9 +39,13 @@ class Topic(Generic[M_co]):
     says: str
     journaled: bool = False
 
-    def key(self, robot: str) -> str:
-        """The Zenoh key expression: `plgrim/@v1/<robot>/<service>/<noun>`."""
-        return f"plgrim/@v1/{robot}/{self.name}"
+    def key(self, robot: str, instance: str = "") -> str:
+        """The Zenoh key expression: `plgrim/@v1/<robot>/<service>/<noun>`.
+
+        instance: `base` or `standby` for what one of two instances of a service says, before it is settled who is
+        obeyed: `plgrim/@v1/<robot>/<instance>/<service>/<noun>`.
+        """
+        return f"plgrim/@v1/{robot}/{instance}/{self.name}" if instance else f"plgrim/@v1/{robot}/{self.name}"
 
 
 @dataclass(frozen=True, slots=True)

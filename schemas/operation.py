@@ -100,6 +100,29 @@ class StageHealth(Message):
     waiting_for: list[str]
 
 
+class LinkReport(Message):
+    """How the link to the base station is, told by the link process on the robot.
+
+    connected: both connections stand. holder, lease: of each service that may run at the base, who is obeyed (`base`
+    or `standby`) and the epoch of that lease. down_kb_per_s (robot to base), up_kb_per_s (base to robot): bytes on the
+    link by topic over the last seconds, in 1000 bytes/s. queued_kb: waiting to be sent, by lane. dropped: by
+    `topic:reason`, since the start. base_age_s: since the newest good word from the base, by service; -1: none yet.
+    """
+
+    schema_name: ClassVar[str] = "link_report"
+
+    connected: bool
+    holder: dict[str, str]
+    lease: dict[str, int]
+    takeovers: int = Field(ge=0)
+    hand_backs: int = Field(ge=0)
+    down_kb_per_s: dict[str, float]
+    up_kb_per_s: dict[str, float]
+    queued_kb: dict[str, float]
+    base_age_s: dict[str, float]
+    dropped: dict[str, int]
+
+
 class JudgeReport(Message):
     """The simulator's judgement, from true poses; no planner reads it."""
 

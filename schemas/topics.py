@@ -6,7 +6,7 @@ from typing import Any
 
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Topic
-from schemas.operation import JudgeReport, MissionCommand, MissionState, StageHealth, WorldPicture
+from schemas.operation import JudgeReport, LinkReport, MissionCommand, MissionState, StageHealth, WorldPicture
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPolicy, Plan
 from schemas.sensing import CoverageScan, FollowerState, Odometry, PointCloud, PoseGraph, ReadyGrid
 from schemas.world import (
@@ -21,6 +21,15 @@ from schemas.world import (
 
 SERVICES = ("riskmap", "irm", "gcp", "lcp", "reconciler", "mission", "status", "sim")
 """The services, in the order in which lock-step runs those that are due at the same time."""
+
+LINK = "link"
+"""The process on the robot that holds the connection to the base station; it exists only where there is one."""
+
+MAY_RUN_AT_BASE = ("irm", "lcp", "gcp")
+"""Stages of which one instance may run at the base and another one, the standby, on the robot."""
+
+INSTANCES = ("base", "standby")
+"""What the two instances of such a stage are called in keys (`Topic.key`)."""
 
 _MS = SECOND_NS // 1000
 _KIB = 1024
@@ -145,11 +154,15 @@ COMMAND: Topic[MissionCommand] = _topic(
     MissionCommand, "status/command", "mission", "what the operator asks", period_ms=0, keep_all=True,
     max_bytes=4 * _KIB, link=True,
 )  # fmt: skip
+LINK_REPORT: Topic[LinkReport] = _topic(
+    LinkReport, "link/report", "status", "use of the link to the base station, and who is obeyed", period_ms=1000,
+    stale_ms=5000, max_bytes=64 * _KIB, link=True,
+)  # fmt: skip
 
 TOPICS: tuple[Topic[Message], ...] = (
     CLOUD, READY_GRID, ODOMETRY, POSE_GRAPH, COVERAGE_SCAN, FOLLOWER, JUDGE, WORLD_PICTURE, RISK_MAP, MOVING, LOCAL_IRM,
     GLOBAL_IRM, COVERAGE, COVERAGE_WINDOW, GLOBAL_POLICY, GCP_GRAPH_REQUEST, MISSION_GRAPH_REQUEST,
-    STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, MISSION, COMMAND,
+    STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, MISSION, COMMAND, LINK_REPORT,
 )  # fmt: skip
 """All topics of the stages. Health topics come on top: `health_topic`."""
 
@@ -175,4 +188,4 @@ def written_by(service: str) -> list[Topic[Message]]:
 
 def topic_named(name: str) -> Topic[Message]:
     """The topic with this name; KeyError when there is none."""
-    return next(t for t in (*TOPICS, *(health_topic(s) for s in SERVICES)) if t.name == name)
+    return next(t for t in (*TOPICS, *(health_topic(s) for s in (*SERVICES, LINK))) if t.name == name)

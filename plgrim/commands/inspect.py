@@ -87,7 +87,7 @@ def _trouble(config: Config, service: str, timeout_s: float) -> str:
         with connect(config.router, config.robot, threading.Event(), timeout_s) as link:
             if service == "router":
                 return ""
-            health = ask_health(link, service, timeout_s)
+            health = ask_health(link, service, timeout_s, config.link.instance(service))
     except NoRouterError as error:
         return str(error)
     if health is None:

@@ -129,9 +129,12 @@ class Heartbeat:
         self._thread.join(2.0)
 
 
-def ask_health(link: Link, service: str, timeout_s: float = 1.0) -> StageHealth | None:
-    """The health of a running service, asked end to end; None when it does not answer. Raises MessageError."""
-    payload = link.ask(query_key(link.robot, service), timeout_s)
+def ask_health(link: Link, service: str, timeout_s: float = 1.0, instance: str = "") -> StageHealth | None:
+    """The health of a running service, asked end to end; None when it does not answer. Raises MessageError.
+
+    instance: which of two instances of the service is asked (`LinkConfig.instance`).
+    """
+    payload = link.ask(query_key(link.robot, f"{instance}/{service}".lstrip("/")), timeout_s)
     if not payload:
         return None
     topic = health_topic(service)

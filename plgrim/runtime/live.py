@@ -104,6 +104,7 @@ class LiveDriver:
         for topic in self._mailbox.topics:
             self._service.link.subscribe(topic, self._accept)
         self._service.mailbox_report = self._mailbox_report
+        self._service.knows = self._knows
         self._service.monitor.ready = True
         self._log.info("ready", period_ms=self._spec.period_ns / 1e6, topics=len(self._mailbox.topics))
         try:
@@ -184,6 +185,10 @@ class LiveDriver:
             raise ServiceFailedError(
                 f"{self._service.name}: {self._errors_in_a_row} steps in a row failed, last: {error!r}"
             ) from error
+
+    def _knows(self) -> dict[str, tuple[int, int]]:
+        with self._wake:
+            return self._mailbox.newest()
 
     def _mailbox_report(self, now: Stamp) -> tuple[dict[str, int], list[str]]:
         with self._wake:

@@ -105,6 +105,14 @@ class Mailbox:
                 queue.popleft()
             queue[-1].fresh = False
 
+    def newest(self) -> dict[str, tuple[int, int]]:
+        """(epoch, sequence) of the newest message of each topic: what its owner can know by now."""
+        return {
+            name: (queue[-1].envelope.epoch, queue[-1].envelope.sequence)
+            for name, queue in self._held.items()
+            if queue
+        }
+
     def state(self) -> dict[str, Any]:
         """For a snapshot: what is held, as the bytes that were received, and what was refused."""
         held = {

@@ -27,8 +27,10 @@ from schemas.topics import health_topic
 class LiveService:
     """A service's life on the wire; a context manager.
 
-    report: gives the health message (called from the heartbeat's thread). epoch: wall-clock ms at the start; it
-    grows from life to life. Raises NoRouterError, AlreadyRunningError.
+    mailbox_report, knows: what was refused and is missing, and the newest message of each input, for the heartbeat
+    (called from its thread). epoch: wall-clock ms at the start; it grows from life to life. Where a service has an
+    instance at the base and one on the robot, each writes keys of its own (`LinkConfig.instance`). Raises
+    NoRouterError, AlreadyRunningError.
     """
 
     def __init__(
@@ -40,13 +42,16 @@ class LiveService:
         self.epoch = next_epoch(config.runtime, config.robot, name, time.time_ns() // 1_000_000)
         self.monitor = monitor or HealthMonitor(name)
         self.mailbox_report: Callable[[Stamp], tuple[dict[str, int], list[str]]] = lambda _: ({}, [])
+        self.knows: Callable[[], dict[str, tuple[int, int]]] = dict
         check_client(config, name)
         self.link: Link = connect(config.router, config.robot, stop, config.runtime.router_timeout_s, name)
         self._outbox = Outbox(config.robot, name, self.epoch)
         self._last = b""
+        self.link.instance = config.link.instance(name)
+        self._path = f"{self.link.instance}/{name}".lstrip("/")
         try:
             self._refuse_second_instance()
-            self.link.answer(query_key(config.robot, name), self._answer)
+            self.link.answer(query_key(config.robot, self._path), self._answer)
         except BaseException:
             self.link.close()
             raise
@@ -64,10 +69,10 @@ class LiveService:
     def _refuse_second_instance(self) -> None:
         """Declare a token, then look for older ones: of two that start together the older one stays."""
         robot = self.config.robot
-        mine = token_key(robot, self.name, f"{time.time_ns():020d}-{os.getpid()}")
+        mine = token_key(robot, self._path, f"{time.time_ns():020d}-{os.getpid()}")
         self.link.token(mine)
         for attempt in range(2):  # the token of a process that was just killed may live for a moment
-            others = [key for key in self.link.tokens(token_key(robot, self.name, "*")) if key < mine]
+            others = [key for key in self.link.tokens(token_key(robot, self._path, "*")) if key < mine]
             if not others:
                 return
             if attempt == 0:
@@ -87,7 +92,7 @@ class LiveService:
     def _beat(self) -> None:
         topic = health_topic(self.name)
         try:
-            self._last = self._outbox.pack(Output(topic, self.health()), self.clock.now_ns(), {})
+            self._last = self._outbox.pack(Output(topic, self.health()), self.clock.now_ns(), self.knows())
             self.link.publish(topic, self._last)
         except (zenoh.ZError, ValueError) as error:
             get_logger().warning("heartbeat failed", error=str(error))

@@ -29,7 +29,7 @@ from schemas.codec import decode
 from schemas.contract import Topic
 from schemas.errors import MessageError
 from schemas.operation import StageHealth
-from schemas.topics import SERVICES, health_topic
+from schemas.topics import LINK, SERVICES, health_topic
 
 ROUTER = "router"
 Command = Callable[[str], list[str]]
@@ -37,7 +37,7 @@ Command = Callable[[str], list[str]]
 
 def plgrim_command(service: str) -> list[str]:
     """The command line of a child."""
-    return [sys.executable, "-m", "plgrim", *([ROUTER] if service == ROUTER else ["run", service])]
+    return [sys.executable, "-m", "plgrim", *([service] if service in (ROUTER, LINK) else ["run", service])]
 
 
 @dataclass(slots=True)
@@ -133,7 +133,8 @@ class Supervisor:
             self._check_fatal(self.children[ROUTER])
             raise
         for child in self._services():
-            self.link.subscribe(health_topic(child.name), self._hear)
+            instance = self.config.link.instance(child.name)
+            self.link.subscribe(health_topic(child.name), self._hear, instance=instance)
             self._spawn(child)
         return self.link
 

@@ -26,6 +26,7 @@ from plgrim.security.access import TOOLS
 from plgrim.security.certificates import CERTIFICATE, KEY, TRUSTED
 from plgrim.security.exposure import certificate_folder
 from schemas.base import Message
+from schemas.compact import compact
 from schemas.contract import SECOND_NS, Topic
 
 _FIFO = 1024
@@ -166,6 +167,8 @@ class Link:
 
     session: zenoh.Session
     robot: str
+    instance: str = ""
+    """Which of two instances of a service publishes here (`Topic.key`); empty: there is one."""
     _threads: list[threading.Thread] = field(default_factory=list)
     _keep: list[Any] = field(default_factory=list)
     _publishers: dict[str, Any] = field(default_factory=dict)
@@ -188,8 +191,11 @@ class Link:
                 thread.join(timeout_s)
 
     def publish(self, topic: Topic[Message], payload: bytes) -> None:
-        """Put bytes on a topic; the publisher is declared by the first message or by `declare`."""
-        self.declare(topic).put(payload)
+        """Put bytes on a topic; the publisher is declared by the first message or by `declare`.
+
+        What an instance at the base says goes over the link as it is put here: in the compact form.
+        """
+        self.declare(topic).put(compact(payload) if self.instance == "base" else payload)
 
     def declare(self, topic: Topic[Message]) -> Any:
         """The publisher of a topic. Congestion drops: a blocked reader must never block a writer."""
@@ -199,7 +205,7 @@ class Link:
         return publisher
 
     def _declare(self, topic: Topic[Message]) -> Any:
-        key = topic.key(self.robot)
+        key = topic.key(self.robot, self.instance)
         qos: dict[str, Any] = {
             "congestion_control": zenoh.CongestionControl.DROP,
             "priority": _priority(topic),
@@ -217,22 +223,30 @@ class Link:
             **qos,
         )
 
-    def subscribe(self, topic: Topic[Message], receive: Receive, every: bool = False) -> None:
+    def subscribe(
+        self,
+        topic: Topic[Message],
+        receive: Receive,
+        every: bool = False,
+        instance: str = "",
+        recover: bool = True,
+    ) -> None:
         """Have a thread of its own call `receive` with each payload of a topic.
 
         Latest-only topics come through a ring of one: what was not fetched is replaced, never queued. every: queue
-        them all the same (for recorders). Exceptions in `receive` are logged and do not end the thread.
+        them all the same (for recorders). instance: of two of the writer, what this one says. recover: False takes
+        what comes and asks nobody for what was said before or was missed. Exceptions in `receive` are logged and do not
+        end the thread.
         """
         channel: Any = (
             zenoh.handlers.FifoChannel(_FIFO) if topic.keep_all or every else zenoh.handlers.RingChannel(1)
         )
-        subscriber = self._subscriber(topic, channel)
+        subscriber = self._subscriber(topic, channel, topic.key(self.robot, instance), recover)
         self._keep.append(subscriber)
         self._spawn(f"sub {topic.name}", subscriber.handler, lambda s: receive(topic, s.payload.to_bytes()))
 
-    def _subscriber(self, topic: Topic[Message], channel: Any) -> Any:
-        key = topic.key(self.robot)
-        if not _is_advanced(topic):
+    def _subscriber(self, topic: Topic[Message], channel: Any, key: str, recover: bool) -> Any:
+        if not (recover and _is_advanced(topic)):
             return self.session.declare_subscriber(key, channel)
         history: dict[str, Any] = {}
         if topic.period_ns > 0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from schemas.topics import SERVICES, TOPICS, health_topic, read_by, topic_named, written_by
+from schemas.topics import LINK, SERVICES, TOPICS, health_topic, read_by, topic_named, written_by
 from tests.schemas.examples import MESSAGES
 
 ALL = (*TOPICS, *(health_topic(service) for service in SERVICES))
@@ -19,7 +19,7 @@ def test_names_and_schema_names_are_unique() -> None:
 
 def test_writers_and_readers_are_services() -> None:
     for topic in ALL:
-        assert topic.writer in SERVICES
+        assert topic.writer in (*SERVICES, LINK)
         assert topic.name.split("/")[0] == topic.writer
         assert set(topic.readers) <= set(SERVICES), topic.name
         assert len(set(topic.readers)) == len(topic.readers), topic.name
@@ -47,6 +47,7 @@ def test_no_planner_reads_the_truth() -> None:
 
 def test_look_ups() -> None:
     assert topic_named("irm/global_irm").key("husky1") == "plgrim/@v1/husky1/irm/global_irm"
+    assert topic_named("irm/global_irm").key("husky1", "base") == "plgrim/@v1/husky1/base/irm/global_irm"
     assert topic_named("gcp/health") == health_topic("gcp")
     assert {topic.name for topic in read_by("status")} >= {f"{service}/health" for service in SERVICES}
     with pytest.raises(StopIteration):

@@ -1,0 +1,1 @@
+"""The link between robot and base station: one process, on the robot (docs/link.md)."""
