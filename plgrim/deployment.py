@@ -6,14 +6,15 @@ from __future__ import annotations
 
 from typing import Literal
 
+from plgrim.config import Config
 from plgrim.errors import ConfigError
-from plgrim.security.access import LINK, ROUTER, TOOLS
-from schemas.topics import SERVICES
+from plgrim.link.config import LinkConfig
+from plgrim.security.access import ROUTER, TOOLS, writers
+from schemas.topics import LINK, MAY_RUN_AT_BASE, SERVICES
 
 Role = Literal["all", "robot", "base"]
 ROLES: tuple[Role, ...] = ("all", "robot", "base")
-USUAL_AT_BASE = ("gcp", "status")
-_STANDBYS = ("irm", "lcp", "gcp")
+USUAL_AT_BASE: tuple[str, ...] = LinkConfig().at_base
 
 
 def role_named(name: str) -> Role:
@@ -22,6 +23,11 @@ def role_named(name: str) -> Role:
         if role == name:
             return role
     raise ConfigError(f"no role {name!r}: there are {', '.join(ROLES)}")
+
+
+def role_of(config: Config) -> Role:
+    """What this host is: `link.host`, or everything at once."""
+    return config.link.host or "all"
 
 
 def services_of(
@@ -35,11 +41,12 @@ def services_of(
     if role == "base":
         return tuple(name for name in found if name in at_base)
     if role == "robot":
-        return tuple(name for name in found if name not in at_base or name in _STANDBYS)
+        return tuple(name for name in found if name not in at_base or name in MAY_RUN_AT_BASE)
     return found
 
 
 def processes_of(role: Role, at_base: tuple[str, ...] = USUAL_AT_BASE) -> tuple[str, ...]:
     """Whoever needs a certificate on a host; `sim` also stands for the gateway that writes its topics."""
     link = (LINK,) if role == "robot" else ()
-    return (ROUTER, *services_of(role, at_base), *link, TOOLS)
+    others = tuple(name for name in writers() if name not in (*SERVICES, LINK))
+    return (ROUTER, *services_of(role, at_base), *link, *others, TOOLS)

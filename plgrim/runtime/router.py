@@ -14,8 +14,9 @@ from plgrim.errors import PlgrimError, PortTakenError
 from plgrim.hosts import SECURE, host_and_port, protocol
 from plgrim.logs import get_logger
 from plgrim.runtime.zenoh_session import open_config, session_config
-from plgrim.security.access import ROUTER, every_topic, router_access
+from plgrim.security.access import ROUTER, every_topic
 from plgrim.security.exposure import check_router
+from plgrim.security.policy import router_access
 
 _MAX_SESSIONS = 128
 _FRAMING_BYTES = 1024 * 1024

@@ -8,20 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from plgrim.hosts import SECURE, protocol
 from schemas.base import Message
 from schemas.contract import Topic
-from schemas.topics import SERVICES, TOPICS, health_topic
-
-if TYPE_CHECKING:
-    from plgrim.config import Config
+from schemas.topics import LINK, SERVICES, TOPICS, health_topic
 
 TOOLS = "tools"
 """The name under which `plgrim watch`, `healthcheck`, `record` and the supervisor read along; they write nothing."""
-LINK = "link"
-"""The process that joins robot and base station."""
 ROUTER = "router"
 
 
@@ -47,7 +41,7 @@ class Grant:
 
 def every_topic() -> list[Topic[Message]]:
     """All topics, health included."""
-    return [*TOPICS, *(health_topic(service) for service in SERVICES)]
+    return [*TOPICS, *(health_topic(service) for service in (*SERVICES, LINK))]
 
 
 def writers() -> tuple[str, ...]:
@@ -85,24 +79,8 @@ def certificate_name(process: str, role: str, robot: str) -> str:
     return f"{process}.{role}.{robot}"
 
 
-def router_access(config: Config) -> dict[str, Any]:
-    """Zenoh's `access_control` for the router of this host.
-
-    Whoever comes with a certificate may do what the table says. Who comes over loopback without TLS, where the router
-    listens there too, may do everything below the robot's keys: that is for a host whose users are all trusted.
-    """
-    robot, role = config.robot, "all"
-    grants = {name: service_grant(name, robot) for name in writers()}
-    grants[TOOLS] = tools_grant(robot)
-    subjects = {name: {"cert_common_names": [certificate_name(name, role, robot)]} for name in grants}
-    endpoints = (config.router.endpoint, *config.router.listen)
-    if any(protocol(endpoint) not in SECURE for endpoint in endpoints):
-        grants["this_host"] = _everything(robot)
-        subjects["this_host"] = {"link_protocols": ["tcp", "unixsock-stream"]}
-    return access_control(grants, subjects)
-
-
-def _everything(robot: str) -> Grant:
+def everything_grant(robot: str) -> Grant:
+    """All that can be done below a robot's keys."""
     keys = (f"{root_of(robot)}/**",)
     return Grant(puts=keys, reads=keys, answers=keys, asks=keys, declares=keys, watches=keys)
 

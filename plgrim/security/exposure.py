@@ -8,6 +8,7 @@ from plgrim.config import Config, RouterConfig
 from plgrim.errors import ConfigError
 from plgrim.hosts import SECURE, is_local, protocol
 from plgrim.security.certificates import CERTIFICATE, KEY, TRUSTED, CertificateError, check_private
+from schemas.topics import LINK
 
 _PLAIN = (
     "and has no TLS: strangers on that network could read the maps and drive the robot. Use a tls/ endpoint with "
@@ -37,6 +38,14 @@ def check_client(config: Config, process: str) -> None:
         raise ExposedError(f"router.{key}: {endpoint} leaves this host {_PLAIN}")
     if protocol(endpoint) in SECURE:
         certificate_folder(config.router, process)
+
+
+def check_link(config: Config) -> None:
+    """Refuse a link to the base without TLS. Raises ExposedError, CertificateError."""
+    if not is_safe(config.link.endpoint, config.deployment.private_network):
+        raise ExposedError(f"link.endpoint: {config.link.endpoint} leaves this host {_PLAIN}")
+    if protocol(config.link.endpoint) in SECURE:
+        certificate_folder(config.router, LINK)
 
 
 def is_safe(endpoint: str, private_network: bool) -> bool:

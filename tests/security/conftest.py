@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
-from plgrim.security.access import ROUTER, TOOLS, certificate_name, writers
+from plgrim.deployment import ROLES, Role, processes_of
+from plgrim.security.access import ROUTER, certificate_name
 from plgrim.security.certificates import Authority
+from schemas.topics import LINK
 from tests.runtime.helpers import REPOSITORY
 
 ROBOT = "husky1"
@@ -28,11 +31,20 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
 
 
 @pytest.fixture(scope="session")
-def certificates(authority: Authority, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a host on which everything runs; the router is known as 127.0.0.1."""
-    folder = tmp_path_factory.mktemp("certs")
-    for process in (ROUTER, *writers(), TOOLS):
-        hosts = ("127.0.0.1",) if process == ROUTER else ()
-        authority.issue(certificate_name(process, "all", ROBOT), folder / process, hosts)
-    authority.trust(folder)
-    return folder
+def certificates_by_role(authority: Authority, tmp_path_factory: pytest.TempPathFactory) -> dict[Role, Path]:
+    """A folder for each kind of host; the routers are known as 127.0.0.1. The link has one certificate for both."""
+    folders = {role: tmp_path_factory.mktemp(f"certs-{role}") for role in ROLES}
+    for role, folder in folders.items():
+        for process in processes_of(role):
+            hosts = ("127.0.0.1",) if process == ROUTER else ()
+            authority.issue(certificate_name(process, role, ROBOT), folder / process, hosts)
+    shutil.copytree(folders["robot"] / LINK, folders["base"] / LINK)
+    for folder in folders.values():
+        authority.trust(folder)
+    return folders
+
+
+@pytest.fixture(scope="session")
+def certificates(certificates_by_role: dict[Role, Path]) -> Path:
+    """Of a host on which everything runs."""
+    return certificates_by_role["all"]

@@ -12,6 +12,8 @@ from typing import Any
 import psutil
 
 from plgrim.config import Config, RouterConfig
+from plgrim.deployment import Role
+from plgrim.link.config import LinkConfig
 from plgrim.runtime.router import run_router
 from plgrim.runtime.zenoh_session import Link, connect
 from tests.runtime.helpers import eventually
@@ -24,10 +26,11 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def secured(robot: str, certificates: Path, **router: Any) -> Config:
+def secured(robot: str, certificates: Path, role: Role = "all", **router: Any) -> Config:
     """A configuration whose router listens with TLS on a free loopback port."""
     settings = {"endpoint": f"tls/127.0.0.1:{free_port()}", "certificates": str(certificates), **router}
-    return Config(robot=robot, router=RouterConfig.model_validate(settings))
+    host = LinkConfig.model_validate({"host": "" if role == "all" else role})
+    return Config(robot=robot, router=RouterConfig.model_validate(settings), link=host)
 
 
 def listens(port: int) -> bool:
