@@ -50,3 +50,14 @@ def processes_of(role: Role, at_base: tuple[str, ...] = USUAL_AT_BASE) -> tuple[
     link = (LINK,) if role == "robot" else ()
     others = tuple(name for name in writers() if name not in (*SERVICES, LINK))
     return (ROUTER, *services_of(role, at_base), *link, *others, TOOLS)
+
+
+def started_by_up(config: Config) -> tuple[str, ...]:
+    """What `plgrim up` starts beside the router, as this host's role says. Raises ConfigError."""
+    role, link = role_of(config), config.link
+    if role == "robot" and not link.endpoint:
+        raise ConfigError(
+            "link.endpoint: where is the base's router? As tls/base:7447, or PLGRIM_LINK__ENDPOINT"
+        )
+    services = services_of(role, link.at_base, config.deployment.simulated)
+    return (*services, LINK) if role == "robot" else services

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from plgrim.errors import PlgrimError
+from plgrim.errors import ConfigError
 
 CERTIFICATE, KEY, TRUSTED = "cert.pem", "key.pem", "trusted.pem"
 """The files of a process: its certificate with the issuer's, its key (0600), the issuers that it trusts."""
@@ -37,10 +37,8 @@ _BACKDATED = dt.timedelta(days=1)
 """A robot without a battery-backed clock may be behind."""
 
 
-class CertificateError(PlgrimError):
+class CertificateError(ConfigError):
     """A certificate folder that cannot be used as asked."""
-
-    exit_code = 2
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from plgrim.config import Config, RouterConfig
+from plgrim.config import Config, RouterConfig, check_service
 from plgrim.errors import ConfigError
 from plgrim.hosts import SECURE, is_local, protocol
 from plgrim.security.certificates import CERTIFICATE, KEY, TRUSTED, CertificateError, check_private
 from schemas.topics import LINK
+from services.status.config import Config as StatusConfig
 
 _PLAIN = (
     "and has no TLS: strangers on that network could read the maps and drive the robot. Use a tls/ endpoint with "
@@ -46,6 +47,16 @@ def check_link(config: Config) -> None:
         raise ExposedError(f"link.endpoint: {config.link.endpoint} leaves this host {_PLAIN}")
     if protocol(config.link.endpoint) in SECURE:
         certificate_folder(config.router, LINK)
+
+
+def check_host(config: Config) -> None:
+    """Refuse, before anything starts, whatever of this host's processes would refuse. Raises ExposedError."""
+    check_router(config)
+    if config.link.host == "robot" and config.link.endpoint:
+        check_link(config)
+    status = check_service(config, "status")
+    if isinstance(status, StatusConfig) and (reason := status.exposed()):
+        raise ExposedError(reason)
 
 
 def is_safe(endpoint: str, private_network: bool) -> bool:

@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from schemas.hosts import is_loopback
 from schemas.topics import SERVICES
 
 
@@ -69,3 +70,15 @@ class Config(BaseModel):
         20_000, ge=10, le=1_000_000, description="Beyond it every second point of the trajectory is dropped."
     )
     ask_again_s: float = Field(5.0, gt=0, le=60, description="Time between requests for the whole graph, s.")
+
+    def exposed(self) -> str:
+        """Why this address must not be listened on, with the mend; empty: it may."""
+        if bool(self.tls_certificate_file) != bool(self.tls_key_file):
+            return "status.tls_certificate_file and status.tls_key_file: set both, or neither"
+        if self.tls_certificate_file or self.trusted_network or is_loopback(self.host):
+            return ""
+        return (
+            f"status.host: {self.host} can be reached from other hosts, and there is no TLS: tokens and data would "
+            "cross the network in the clear. Set status.tls_certificate_file and status.tls_key_file "
+            "(`plgrim certs issue` makes them), or listen on 127.0.0.1"
+        )

@@ -135,15 +135,8 @@ def _token(words: list[str], where: str) -> Token:
 
 def check_binding(config: Config) -> None:
     """Refuse to listen in the open without TLS. Raises SecurityError with the mend."""
-    if bool(config.tls_certificate_file) != bool(config.tls_key_file):
-        raise SecurityError("status.tls_certificate_file and status.tls_key_file: set both, or neither")
-    if config.tls_certificate_file or config.trusted_network or is_loopback(config.host):
-        return
-    raise SecurityError(
-        f"status.host: {config.host} can be reached from other hosts, and there is no TLS: tokens and data would cross "
-        "the network in the clear. Set status.tls_certificate_file and status.tls_key_file "
-        "(`plgrim certs issue` makes them), or listen on 127.0.0.1"
-    )
+    if reason := config.exposed():
+        raise SecurityError(reason)
 
 
 _bearer = HTTPBearer(auto_error=False, description="A token of the role viewer or operator.")

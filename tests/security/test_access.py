@@ -84,7 +84,9 @@ class Host:
                 key = self.health_key(process)
                 self.links[process].session.put(key, word)
                 eventually(lambda key=key, word=word: (key, word) in self.heard, f"{process} is heard")  # type: ignore[misc]
-        self.links[TOOLS].tokens(f"{root_of(ROBOT)}/**")  # it writes nothing: a question makes the round instead
+        self.links[TOOLS].tokens(
+            f"{root_of(ROBOT)}/**"
+        )  # it writes nothing: a question makes the round instead
         self.heard[:] = [entry for entry in self.heard if not entry[1].startswith(b"last word")]
 
 
