@@ -21,6 +21,11 @@ ROBOT = 0
 Key = int | tuple[int, int]
 
 
+def edge_key(a: int, b: int) -> tuple[int, int]:
+    """The name of an edge, whichever end comes first."""
+    return min(a, b), max(a, b)
+
+
 class RoadGraph:
     """Nodes with x, y, z, kind, gain, coverage; edges with distance, risk, driven. All changes go through here.
 
@@ -108,7 +113,7 @@ class RoadGraph:
         """Add an edge or replace what is known of it."""
         is_new = not self.graph.has_edge(a, b)
         self.graph.add_edge(a, b, distance=distance, risk=risk, driven=driven)
-        self._changed.add((min(a, b), max(a, b)))
+        self._changed.add(edge_key(a, b))
         if is_new and self._is_crumb(a) and self._is_crumb(b):
             self._components.join(a, b)
 
@@ -117,12 +122,12 @@ class RoadGraph:
         if a > b:  # the line turned round: 1 - t along it, and -s across
             way = [1.0 - v if i % 2 == 0 else -v for i, v in enumerate(way)]
         self.graph.edges[a, b]["way"] = way
-        self._new_ways.add((min(a, b), max(a, b)))
+        self._new_ways.add(edge_key(a, b))
 
     def drop_edge(self, a: int, b: int) -> None:
         """Remove an edge."""
         self.graph.remove_edge(a, b)
-        self._changed.add((min(a, b), max(a, b)))
+        self._changed.add(edge_key(a, b))
         if self._is_crumb(a) and self._is_crumb(b):
             self._components.part(a, b, self._crumbs_beside)
 
@@ -190,7 +195,7 @@ class RoadGraph:
 
     def _all_keys(self) -> Iterable[Key]:
         yield from self.graph.nodes
-        yield from ((min(a, b), max(a, b)) for a, b in self.graph.edges)
+        yield from (edge_key(a, b) for a, b in self.graph.edges)
 
     def _exists(self, key: Key) -> bool:
         return key in self.graph if isinstance(key, int) else self.graph.has_edge(*key)
@@ -208,7 +213,7 @@ class RoadGraph:
         """For a snapshot."""
         return {
             "nodes": [[n, dict(d)] for n, d in sorted(self.graph.nodes(data=True))],
-            "edges": sorted([min(a, b), max(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
+            "edges": sorted([*edge_key(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
             "unpublished": self._unpublished(),
         }
 
