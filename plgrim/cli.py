@@ -7,6 +7,7 @@ import sys
 import typer
 
 from plgrim.commands import (
+    certs,
     doctor,
     evaluate,
     feed,
@@ -27,7 +28,7 @@ application = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_show_locals=False,
 )
-for room in (missions, services, link, doctor, record, report, foxglove, feed, evaluate, inspect):
+for room in (missions, services, link, doctor, record, report, foxglove, feed, evaluate, inspect, certs):
     room.register(application)
 add_examples(application)
 

@@ -25,6 +25,7 @@ from plgrim.config_keys import check_env_name, check_keys, describe
 from plgrim.errors import ConfigError
 from plgrim.link.config import LinkConfig
 from plgrim.registry import STAGES
+from schemas.hosts import is_loopback
 
 PREFIX = "PLGRIM_"
 _FILE: ContextVar[str] = ContextVar("configuration_file", default="")
@@ -40,6 +41,11 @@ class RouterConfig(_Section):
 
     endpoint: str = Field("tcp/127.0.0.1:7457", pattern=r"^(tcp|tls|quic|ws|unixsock-stream)/.+")
     """Where the router listens and clients connect. `tcp/0.0.0.0:7457` listens on every interface."""
+    listen: tuple[str, ...] = ()
+    """Where else the router listens, as `tls/0.0.0.0:7447` for the link of a robot. Beyond this host only with TLS."""
+    certificates: str = ""
+    """Folder with `cert.pem`, `key.pem` and `trusted.pem` of a process, or a folder of such folders, one a process
+    (`router/`, `gcp/`, `link/`, ...). `plgrim certs issue` makes it. For endpoints with TLS."""
     connect: str = ""
     """Where clients connect when it is not `endpoint` (in containers: `tcp/router:7457`). Empty: `endpoint`."""
     shared_memory: bool = False
@@ -111,6 +117,21 @@ DEFAULT_PROFILE: Literal["spot"] = "spot"
 """Also that of the services' own defaults."""
 
 
+class DeploymentConfig(_Section):
+    """What a host runs, and who can reach it. docs/deployment.md."""
+
+    simulated: bool = True
+    """Whether a simulator is the robot's body. False: a gateway of your own writes the `sim/...` topics."""
+    published_on: str = ""
+    """In a container: the address of its host at which its ports are published, or `none`. What listens without TLS is
+    then reached by its own compose project and, with a loopback address, by the host alone. Empty: no container."""
+
+    @property
+    def private_network(self) -> bool:
+        """Whether the interfaces that this process sees lead to no stranger."""
+        return self.published_on == "none" or (bool(self.published_on) and is_loopback(self.published_on))
+
+
 class Config(BaseSettings):
     """Everything. The sections of services are checked by the service's own `Config`, loaded when asked for."""
 
@@ -125,6 +146,7 @@ class Config(BaseSettings):
     router: RouterConfig = RouterConfig()
     clock: ClockConfig = ClockConfig()
     runtime: RuntimeConfig = RuntimeConfig()
+    deployment: DeploymentConfig = DeploymentConfig()
     link: LinkConfig = LinkConfig()
     riskmap: dict[str, Any] = Field(default_factory=dict)
     irm: dict[str, Any] = Field(default_factory=dict)
@@ -175,6 +197,8 @@ class Config(BaseSettings):
                     "turn_room_m": ROUGH_TURN_ROOM_M,
                     **section,
                 }
+        if service == "status" and self.deployment.private_network:
+            section.setdefault("trusted_network", True)
         if service == "riskmap" and rough:
             section.setdefault("model", "terrain")
         elif service == "gcp" and rough:

@@ -22,6 +22,7 @@ from plgrim.commands.options import (
     put,
     world_overrides,
 )
+from schemas.topics import SERVICES
 
 if TYPE_CHECKING:
     from plgrim.config import Config
@@ -72,14 +73,24 @@ def explore(
 
 def up(
     keep: Annotated[bool, typer.Option("--keep", help="Go on after the mission's end.")] = False,
+    role: Annotated[
+        str | None, typer.Option(help="What this host is: robot, base or all (default: link.host).")
+    ] = None,
     speed: Speed = None,
     out: OutFolder = Path("out/up"),
     config_file: ConfigFile = None,
 ) -> None:
-    """Start the router and all services as configured, and watch over them until the mission's end or Ctrl-C."""
+    """Start this host's router and services, and watch over them until the mission's end or Ctrl-C."""
+    from plgrim.deployment import role_named, role_of, started_by_up
+
     overrides: dict[str, Any] = {}
     put(overrides, "clock.speed", speed)
-    _live(prepare(config_file, overrides), out, until_end=not keep, hold_failed_s=0.0)
+    if role is not None:
+        put(overrides, "link.host", "" if role_named(role) == "all" else role)
+    config = prepare(config_file, overrides, with_world=role != "base")
+    services = started_by_up(config)
+    until_end = not keep and role_of(config) == "all"
+    _live(config, out, until_end=until_end, services=services, hold_failed_s=0.0)
 
 
 def resume(
@@ -87,9 +98,11 @@ def resume(
     keep: Annotated[bool, typer.Option("--keep", help="Go on after the mission's end.")] = False,
 ) -> None:
     """Go on with a mission of which everything died (a power cut), from the journals in its folder."""
+    from plgrim.deployment import started_by_up
     from plgrim.runtime.run_folder import with_kept_state
 
-    _live(with_kept_state(folder), folder, until_end=not keep, resume=True)
+    config = with_kept_state(folder)
+    _live(config, folder, until_end=not keep, services=started_by_up(config), resume=True)
 
 
 def watch(out: OutFolder = Path("out/watch"), config_file: ConfigFile = None) -> None:
@@ -129,6 +142,7 @@ def _live(
     out: Path,
     until_end: bool = True,
     peer_tour: bool = False,
+    services: tuple[str, ...] = SERVICES,
     hold_failed_s: float = _HOLD_FAILED_S,
     resume: bool = False,
 ) -> None:
@@ -138,20 +152,24 @@ def _live(
     from plgrim.missions import run_live, status_address
     from plgrim.runtime.process import die_with_parent, stop_on_signals
     from plgrim.runtime.router import check_port_free
+    from plgrim.security.exposure import check_host
 
     die_with_parent()
     configure_logs("plgrim")
+    check_host(config)
     if until_end and not config.runtime.hold_failed_s:
         runtime = config.runtime.model_copy(update={"hold_failed_s": hold_failed_s})
         config = config.model_copy(update={"runtime": runtime})
-    check_port_free(
-        *status_address(config), "choose another for the status page with PLGRIM_STATUS__PORT, or status.port"
-    )
+    if "status" in services:
+        check_port_free(
+            *status_address(config),
+            "choose another for the status page with PLGRIM_STATUS__PORT, or status.port",
+        )
     if config.clock.source == "monotonic" and not config.clock.origin_ns:
         clock = config.clock.model_copy(update={"origin_ns": time.monotonic_ns()})
         config = config.model_copy(update={"clock": clock})
     with stop_on_signals() as stop:
-        result = run_live(config, out, stop, _console(), until_end, resume=resume)
+        result = run_live(config, out, stop, _console(), until_end, services, resume=resume)
     _finish(_beside_tour(config, result, out) if peer_tour else result, out)
 
 

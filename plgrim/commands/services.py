@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import threading
@@ -77,21 +78,27 @@ def router(
     listen: Annotated[
         str | None, typer.Option(help="Endpoint, as tcp/127.0.0.1:7457 (default: router.endpoint).")
     ] = None,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print its configuration, for a stock zenohd too, and end.")
+    ] = False,
 ) -> None:
     """Run the Zenoh router of this host until Ctrl-C."""
     from plgrim.commands.options import put
     from plgrim.config import load_config
     from plgrim.logs import configure_logs
     from plgrim.runtime.process import die_with_parent, stop_on_signals
-    from plgrim.runtime.router import run_router
+    from plgrim.runtime.router import router_settings, run_router
 
     die_with_parent()
     configure_logs("router")
     overrides: dict[str, object] = {}
     put(overrides, "router.endpoint", listen)
     config = load_config(config_file, overrides)
+    if print_config:
+        print(json.dumps(router_settings(config), indent=2))
+        return
     with stop_on_signals() as stop:
-        run_router(config.router, stop)
+        run_router(config, stop)
 
 
 def register(app: typer.Typer) -> None:

@@ -22,6 +22,7 @@ from plgrim.link.uplink import Meters, Uplink, Wanted
 from plgrim.logs import get_logger
 from plgrim.runtime.mailbox import Mailbox, Outbox
 from plgrim.runtime.service import LiveService
+from plgrim.security.exposure import check_link
 from schemas.base import Message
 from schemas.codec import peek
 from schemas.contract import SECOND_NS, Output, Stamp, Topic
@@ -39,6 +40,7 @@ def run_link(config: Config, stop: threading.Event) -> None:
             "link: this host has no link: set link.host to robot and link.endpoint to the base's router, as "
             "tls/base:7447"
         )
+    check_link(config)
     with LiveService(LINK, config, stop) as service:
         LinkProcess(service).run(stop)
 

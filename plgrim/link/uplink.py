@@ -23,6 +23,7 @@ from plgrim.runtime.zenoh_session import Link, is_latched, open_session
 from schemas.base import Message
 from schemas.compact import compact
 from schemas.contract import Topic
+from schemas.topics import LINK
 
 _LOOK_S = 0.1
 _TRY_S = 10.0
@@ -121,7 +122,7 @@ class Uplink:
         router = base_router(self._config, self.name)
         while not self._stop.is_set():
             try:
-                return open_session(router, "client", self._stop, _TRY_S)
+                return open_session(router, "client", self._stop, _TRY_S, LINK)
             except NoRouterError:
                 if not self._stop.is_set():
                     get_logger().warning("the base does not answer", endpoint=router.endpoint, lane=self.name)

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import threading
+from typing import Any
 
 import zenoh
 
-from plgrim.config import RouterConfig
+from plgrim.config import Config
 from plgrim.errors import PlgrimError, PortTakenError
+from plgrim.hosts import SECURE, host_and_port, protocol
 from plgrim.logs import get_logger
-from plgrim.runtime.zenoh_session import open_session
+from plgrim.runtime.zenoh_session import open_config, session_config
+from plgrim.security.access import ROUTER, every_topic
+from plgrim.security.exposure import check_router
+from plgrim.security.policy import router_access
 
-
-def host_and_port(endpoint: str) -> tuple[str, int] | None:
-    """Host and port of a TCP-like endpoint (`tcp/127.0.0.1:7457`); None for others (unix sockets)."""
-    protocol, _, address = endpoint.partition("/")
-    address = address.split("?")[0].split("#")[0]
-    host, _, port = address.rpartition(":")
-    if protocol not in ("tcp", "tls", "ws") or not port.isdigit():
-        return None
-    return host.strip("[]"), int(port)
+_MAX_SESSIONS = 128
+_FRAMING_BYTES = 1024 * 1024
 
 
 def check_port_free(host: str, port: int, mend: str) -> None:
@@ -54,18 +53,64 @@ def page_address(host: str, port: int) -> str:
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
-def run_router(config: RouterConfig, stop: threading.Event) -> None:
-    """Route until `stop` is set. Raises PortTakenError."""
-    check_endpoint_free(config.endpoint)
+def router_settings(config: Config) -> dict[str, Any]:
+    """Zenoh's configuration of this host's router; as JSON5 also that of a stock zenohd. Raises ConfigError."""
+    check_router(config)
+    settings = session_config(config.router, "router", ROUTER)
+    settings["transport"]["unicast"]["max_sessions"] = _MAX_SESSIONS
+    settings["transport"]["link"]["rx"] = {"max_message_size": largest_message_bytes()}
+    endpoints = [config.router.endpoint, *config.router.listen]
+    if any(protocol(endpoint) in SECURE for endpoint in endpoints):
+        settings["access_control"] = router_access(config)
+    return settings
+
+
+def largest_message_bytes() -> int:
+    """More than any message on the wire has."""
+    return max(topic.max_bytes for topic in every_topic()) + _FRAMING_BYTES
+
+
+def run_router(config: Config, stop: threading.Event) -> None:
+    """Route until `stop` is set; open anew when the certificates on the disk change.
+
+    Raises ConfigError, PortTakenError.
+    """
+    settings = router_settings(config)
+    endpoints = [config.router.endpoint, *config.router.listen]
+    for endpoint in endpoints:
+        check_endpoint_free(endpoint)
+    while not stop.is_set():
+        seen = _certificates_seen(settings)
+        session = _open(config, settings, stop)
+        get_logger().info("router listens", endpoints=endpoints, access_control="access_control" in settings)
+        try:
+            while not stop.wait(0.5) and seen == _certificates_seen(settings):
+                pass
+        finally:
+            session.close()  # type: ignore[no-untyped-call]
+        if not stop.is_set():
+            get_logger().info("the certificates have changed: all connections begin anew")
+
+
+def _open(config: Config, settings: dict[str, Any], stop: threading.Event) -> zenoh.Session:
     try:
-        session = open_session(config, "router", stop, 0.0)
+        return open_config(settings, config.router, stop, 0.0)
     except zenoh.ZError as error:
+        places = ", ".join([config.router.endpoint, *config.router.listen])
         if "in use" in str(error):
-            raise PortTakenError(f"{config.endpoint} is taken: choose another with PLGRIM_ROUTER") from error
-        raise PlgrimError(f"the router cannot listen on {config.endpoint}: {str(error)[:300]}") from error
-    get_logger().info("router listens", endpoint=config.endpoint)
-    try:
-        while not stop.wait(0.5):
-            pass
-    finally:
-        session.close()  # type: ignore[no-untyped-call]
+            raise PortTakenError(f"{places} is taken: choose another with PLGRIM_ROUTER") from error
+        raise PlgrimError(f"the router cannot listen on {places}: {str(error)[:300]}") from error
+
+
+def _certificates_seen(settings: dict[str, Any]) -> list[tuple[int, int]]:
+    """Changes when somebody writes the certificate, the key or the trusted issuers."""
+    tls = settings["transport"]["link"].get("tls", {})
+    seen = []
+    for value in tls.values():
+        try:
+            status = os.stat(value) if isinstance(value, str) else None
+        except OSError:
+            continue
+        if status is not None:
+            seen.append((status.st_ino, status.st_mtime_ns))
+    return seen

@@ -19,6 +19,7 @@ from plgrim.runtime.keeper import next_epoch
 from plgrim.runtime.mailbox import Outbox
 from plgrim.runtime.pulse import Pulse
 from plgrim.runtime.zenoh_session import Link, connect
+from plgrim.security.exposure import check_client
 from schemas.contract import Output, Stamp
 from schemas.operation import StageHealth
 from schemas.topics import health_topic
@@ -43,7 +44,8 @@ class LiveService:
         self.monitor = monitor or HealthMonitor(name, pulse=Pulse.of_environment())
         self.mailbox_report: Callable[[Stamp], tuple[dict[str, int], list[str]]] = lambda _: ({}, [])
         self.knows: Callable[[], dict[str, tuple[int, int]]] = dict
-        self.link: Link = connect(config.router, config.robot, stop, config.runtime.router_timeout_s)
+        check_client(config, name)
+        self.link: Link = connect(config.router, config.robot, stop, config.runtime.router_timeout_s, name)
         self._outbox = Outbox(config.robot, name, self.epoch)
         self._last = b""
         self.link.instance = config.link.instance(name)

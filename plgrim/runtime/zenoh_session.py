@@ -20,7 +20,11 @@ from zenoh import ext
 
 from plgrim.config import RouterConfig
 from plgrim.errors import NoRouterError
+from plgrim.hosts import SECURE, protocol
 from plgrim.logs import get_logger
+from plgrim.security.access import TOOLS
+from plgrim.security.certificates import CERTIFICATE, KEY, TRUSTED
+from plgrim.security.exposure import certificate_folder
 from schemas.base import Message
 from schemas.compact import compact
 from schemas.contract import SECOND_NS, Topic
@@ -33,14 +37,18 @@ _OPEN_TIMEOUT_MS = 2000
 Receive = Callable[[Topic[Message], bytes], None]
 
 
-def session_config(router: RouterConfig, mode: str) -> dict[str, Any]:
-    """Zenoh's configuration. mode: `client` (connects) or `router` (listens)."""
+def session_config(router: RouterConfig, mode: str, process: str = TOOLS) -> dict[str, Any]:
+    """Zenoh's configuration. mode: `client` (connects) or `router` (listens). process: whose certificate to show.
+
+    Raises CertificateError.
+    """
+    endpoints = [router.endpoint, *router.listen] if mode == "router" else [router.client_endpoint]
     place: dict[str, Any] = (
-        {"listen": {"endpoints": [router.endpoint], "exit_on_failure": True}}
+        {"listen": {"endpoints": endpoints, "exit_on_failure": True}}
         if mode == "router"
         else {
             "connect": {
-                "endpoints": [router.client_endpoint],
+                "endpoints": endpoints,
                 "timeout_ms": _OPEN_TIMEOUT_MS,
                 "retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2},
             }
@@ -52,10 +60,12 @@ def session_config(router: RouterConfig, mode: str) -> dict[str, Any]:
         "timestamping": {"enabled": False},
         "queries_default_timeout": 1000,
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "adminspace": {"enabled": False},
         "transport": {
             "shared_memory": {"enabled": router.shared_memory},
             "unicast": {"open_timeout": 1500, "accept_timeout": 1500},
             "link": {
+                **_tls(router, mode, process, endpoints),
                 "tx": {
                     "lease": router.lease_ms,
                     "keep_alive": 4,
@@ -66,19 +76,46 @@ def session_config(router: RouterConfig, mode: str) -> dict[str, Any]:
                             "block": {"wait_before_close": 1_000_000},
                         }
                     },
-                }
+                },
             },
         },
     }
 
 
-def open_session(router: RouterConfig, mode: str, stop: threading.Event, timeout_s: float) -> zenoh.Session:
+def _tls(router: RouterConfig, mode: str, process: str, endpoints: list[str]) -> dict[str, Any]:
+    """Mutual TLS, where an endpoint has it. Both sides trust the issuers in `trusted.pem`, and nobody else."""
+    if not any(protocol(endpoint) in SECURE for endpoint in endpoints):
+        return {}
+    folder = certificate_folder(router, process)
+    side = "listen" if mode == "router" else "connect"
+    return {
+        "tls": {
+            "enable_mtls": True,
+            "root_ca_certificate": str(folder / TRUSTED),
+            f"{side}_certificate": str(folder / CERTIFICATE),
+            f"{side}_private_key": str(folder / KEY),
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+    }
+
+
+def open_session(
+    router: RouterConfig, mode: str, stop: threading.Event, timeout_s: float, process: str = TOOLS
+) -> zenoh.Session:
     """Open a session; a client waits for its router in short tries, so that signals are served in between.
 
     Raises NoRouterError after `timeout_s`, or when `stop` is set; zenoh.ZError when a router cannot listen.
     """
+    return open_config(session_config(router, mode, process), router, stop, timeout_s)
+
+
+def open_config(
+    settings: dict[str, Any], router: RouterConfig, stop: threading.Event, timeout_s: float
+) -> zenoh.Session:
+    """Open a session from Zenoh's own configuration. Raises as `open_session` does."""
     zenoh.init_log_from_env_or("error")
-    config = json.dumps(session_config(router, mode))
+    mode, config = settings["mode"], json.dumps(settings)
     deadline = time.monotonic() + timeout_s
     while True:
         try:
@@ -89,9 +126,16 @@ def open_session(router: RouterConfig, mode: str, stop: threading.Event, timeout
             if stop.is_set() or time.monotonic() > deadline:
                 raise NoRouterError(
                     f"no Zenoh router answers at {router.client_endpoint}: start one with `plgrim router`, "
-                    f"or name another with router.endpoint or PLGRIM_ROUTER ({_first_line(error)})"
+                    f"or name another with router.endpoint or PLGRIM_ROUTER ({_first_line(error)}){_hint(router)}"
                 ) from error
             stop.wait(0.3)
+
+
+def _hint(router: RouterConfig) -> str:
+    """Zenoh says no more than `Timeout!` when a certificate is refused."""
+    if protocol(router.client_endpoint) not in SECURE:
+        return ""
+    return "; or one of the certificates was refused: expired, revoked, of another authority, or for another host name"
 
 
 def _first_line(error: BaseException) -> str:
@@ -269,6 +313,8 @@ def _priority(topic: Topic[Message]) -> zenoh.Priority:
     return zenoh.Priority.DATA
 
 
-def connect(router: RouterConfig, robot: str, stop: threading.Event, timeout_s: float) -> Link:
-    """A client session as a Link. Raises NoRouterError."""
-    return Link(open_session(router, "client", stop, timeout_s), robot)
+def connect(
+    router: RouterConfig, robot: str, stop: threading.Event, timeout_s: float, process: str = TOOLS
+) -> Link:
+    """A client session as a Link. process: as who it connects. Raises NoRouterError, CertificateError."""
+    return Link(open_session(router, "client", stop, timeout_s, process), robot)

@@ -249,7 +249,7 @@ def main() -> None:
         def run(name: str) -> None:
             try:
                 if name == "router":
-                    run_router(config.router, event)
+                    run_router(config, event)
                 elif name == "link":
                     run_link(config, event)
                 elif name.startswith("observe:"):

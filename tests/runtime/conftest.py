@@ -64,7 +64,7 @@ def config(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> Config:
 def router(config: Config) -> Iterator[None]:
     """A router in a thread of this process."""
     stop = threading.Event()
-    thread = threading.Thread(target=run_router, args=(config.router, stop))
+    thread = threading.Thread(target=run_router, args=(config, stop))
     thread.start()
     yield
     stop.set()

@@ -181,7 +181,7 @@ def main() -> None:
     with stop_on_signals() as stop:
         try:
             if name == "router":
-                run_router(config.router, stop)
+                run_router(config, stop)
             else:
                 drive(name, config, lambda: make_fake(name, behaviour), stop)
         except PlgrimError as error:

@@ -16,9 +16,10 @@ from rich.console import Console
 
 from plgrim.config import Config
 from plgrim.errors import PortTakenError, ServiceFailedError
+from plgrim.hosts import host_and_port
 from plgrim.missions import run_live
 from plgrim.runtime.process import THREAD_LIMITS, child_environment
-from plgrim.runtime.router import check_endpoint_free, host_and_port
+from plgrim.runtime.router import check_endpoint_free
 from plgrim.runtime.supervisor import Supervisor, with_fresh_state
 from schemas.base import Message
 from schemas.codec import decode

@@ -1,0 +1,1 @@
+"""Certificates, access control, and what a deployment may expose."""

@@ -1,0 +1,81 @@
+"""What a configuration may expose: beyond this host nothing without mutual TLS. Checked before anything listens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from plgrim.config import Config, RouterConfig, check_service
+from plgrim.errors import ConfigError
+from plgrim.hosts import SECURE, is_local, protocol
+from plgrim.security.certificates import CERTIFICATE, KEY, TRUSTED, CertificateError, check_private
+from schemas.topics import LINK
+from services.status.config import Config as StatusConfig
+
+_PLAIN = (
+    "and has no TLS: strangers on that network could read the maps and drive the robot. Use a tls/ endpoint with "
+    "router.certificates (`plgrim certs issue` makes them), or stay on 127.0.0.1"
+)
+
+
+class ExposedError(ConfigError):
+    """A configuration that would open a port, or make a connection, beyond this host without TLS."""
+
+
+def check_router(config: Config) -> None:
+    """Refuse a router that listens beyond this host without TLS. Raises ExposedError, CertificateError."""
+    router = config.router
+    for name, endpoint in (("endpoint", router.endpoint), *(("listen", one) for one in router.listen)):
+        if not is_safe(endpoint, config.deployment.private_network):
+            raise ExposedError(f"router.{name}: {endpoint} can be reached from other hosts {_PLAIN}")
+    if any(protocol(endpoint) in SECURE for endpoint in (router.endpoint, *router.listen)):
+        certificate_folder(router, "router")
+
+
+def check_client(config: Config, process: str) -> None:
+    """Refuse a connection to another host's router without TLS. Raises ExposedError, CertificateError."""
+    endpoint = config.router.client_endpoint
+    if not is_safe(endpoint, config.deployment.private_network):
+        key = "connect" if config.router.connect else "endpoint"
+        raise ExposedError(f"router.{key}: {endpoint} leaves this host {_PLAIN}")
+    if protocol(endpoint) in SECURE:
+        certificate_folder(config.router, process)
+
+
+def check_link(config: Config) -> None:
+    """Refuse a link to the base without TLS. Raises ExposedError, CertificateError."""
+    if not is_safe(config.link.endpoint, config.deployment.private_network):
+        raise ExposedError(f"link.endpoint: {config.link.endpoint} leaves this host {_PLAIN}")
+    if protocol(config.link.endpoint) in SECURE:
+        certificate_folder(config.router, LINK)
+
+
+def check_host(config: Config) -> None:
+    """Refuse, before anything starts, whatever of this host's processes would refuse. Raises ExposedError."""
+    check_router(config)
+    if config.link.host == "robot" and config.link.endpoint:
+        check_link(config)
+    status = check_service(config, "status")
+    if isinstance(status, StatusConfig) and (reason := status.exposed()):
+        raise ExposedError(reason)
+
+
+def is_safe(endpoint: str, private_network: bool) -> bool:
+    """Whether an endpoint has TLS, or no stranger on its way."""
+    return protocol(endpoint) in SECURE or is_local(endpoint) or private_network
+
+
+def certificate_folder(router: RouterConfig, process: str) -> Path:
+    """The folder with the certificate, key and trusted issuers of a process. Raises CertificateError."""
+    if not router.certificates:
+        raise CertificateError(
+            "router.certificates: an endpoint with TLS needs the folder of the certificates: `plgrim certs issue`"
+        )
+    root = Path(router.certificates)
+    folder = root if (root / CERTIFICATE).is_file() else root / process
+    for name in (CERTIFICATE, KEY, TRUSTED):
+        if not (folder / name).is_file():
+            raise CertificateError(
+                f"router.certificates: {folder / name} is missing or cannot be read: make it with `plgrim certs issue`"
+            )
+    check_private(folder / KEY)
+    return folder

@@ -1,0 +1,76 @@
+"""What would be open to strangers does not start, and says why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from plgrim.cli import application
+from plgrim.config import load_config
+from plgrim.errors import ConfigError
+from plgrim.security.exposure import ExposedError, check_client, check_host, check_link, check_router
+
+OPEN = ["tcp/0.0.0.0:7457", "tcp/[::]:7457", "tcp/192.0.2.1:7457", "tcp/base.local:7457", "ws/0.0.0.0:7457"]
+
+
+@pytest.mark.parametrize("endpoint", OPEN)
+def test_an_open_router_is_refused(endpoint: str) -> None:
+    with pytest.raises(ExposedError, match=r"router\.endpoint: .* has no TLS.*plgrim certs issue"):
+        check_router(load_config(overrides={"router": {"endpoint": endpoint}}))
+    with pytest.raises(ExposedError, match=r"router\.listen"):
+        check_router(load_config(overrides={"router": {"listen": [endpoint]}}))
+
+
+def test_what_stays_on_the_host_needs_no_tls() -> None:
+    for endpoint in (
+        "tcp/127.0.0.1:7457",
+        "tcp/[::1]:7457",
+        "tcp/localhost:7457",
+        "unixsock-stream//run/router",
+    ):
+        check_router(load_config(overrides={"router": {"endpoint": endpoint}}))
+
+
+def test_connections_to_other_hosts_need_tls() -> None:
+    with pytest.raises(ExposedError, match=r"router\.connect"):
+        check_client(load_config(overrides={"router": {"connect": "tcp/base:7457"}}), "gcp")
+    with pytest.raises(ExposedError, match=r"link\.endpoint"):
+        check_link(load_config(overrides={"link": {"endpoint": "tcp/base:7447", "host": "robot"}}))
+    with pytest.raises(ConfigError, match=r"router\.certificates"):
+        check_link(load_config(overrides={"link": {"endpoint": "tls/base:7447", "host": "robot"}}))
+
+
+@pytest.mark.parametrize(
+    ("published", "refused"), [("none", False), ("127.0.0.1", False), ("0.0.0.0", True), ("", True)]
+)
+def test_a_container_is_as_open_as_it_is_published(published: str, refused: bool) -> None:
+    overrides: dict[str, Any] = {
+        "router": {"endpoint": OPEN[0]},
+        "status": {"host": "0.0.0.0"},
+        "deployment": {"published_on": published},
+    }
+    config = load_config(overrides=overrides)
+    if refused:
+        with pytest.raises(ExposedError):
+            check_host(config)
+    else:
+        check_host(config)
+
+
+def test_an_open_status_page_is_refused() -> None:
+    with pytest.raises(ExposedError, match=r"status\.host: 0\.0\.0\.0 .*no TLS"):
+        check_host(load_config(overrides={"status": {"host": "0.0.0.0"}}))
+
+
+@pytest.mark.parametrize("command", [["router"], ["up"], ["run", "gcp"]])
+def test_the_commands_refuse_to_start(command: list[str], tmp_path: Path) -> None:
+    """The deployment file as a user would write it."""
+    file = tmp_path / "open.yaml"
+    file.write_text("router: {endpoint: 'tcp/0.0.0.0:7457', connect: 'tcp/192.0.2.1:7457'}\n")
+    out = ["--out", str(tmp_path / "out")] if command == ["up"] else []
+    result = CliRunner().invoke(application, [*command, "--config", str(file), *out])
+    assert isinstance(result.exception, ExposedError), result.output
+    assert not (tmp_path / "out").exists()
