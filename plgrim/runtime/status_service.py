@@ -6,7 +6,7 @@ import threading
 from typing import cast
 
 from plgrim.config import Config, check_service
-from plgrim.errors import PortTakenError
+from plgrim.errors import ConfigError, PortTakenError
 from plgrim.logs import get_logger
 from plgrim.runtime.clock import MissionClock
 from plgrim.runtime.keeper import Keeper
@@ -18,6 +18,7 @@ from schemas.contract import Output, Topic
 from schemas.topics import STATUS_GRAPH_REQUEST, read_by
 from services.status import app
 from services.status.config import Config as StatusConfig
+from services.status.security import SecurityError
 
 _TICK_S = 0.2
 
@@ -58,6 +59,8 @@ def run_status(config: Config, stop: threading.Event) -> None:
         server = app.StatusServer(shared)
     except app.PortTakenError as error:
         raise PortTakenError(f"{error} in the configuration, or PLGRIM_STATUS__PORT") from error
+    except (SecurityError, OSError) as error:
+        raise ConfigError(f"status: {error}") from error
     try:
         with LiveService("status", config, stop) as service:
             keeper = Keeper.of(config.runtime, config.robot, "status")

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 
 import uvicorn
-from fastapi import FastAPI, Response
+from fastapi import Depends, FastAPI, Response
 from fastapi.responses import HTMLResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
 
@@ -22,6 +22,7 @@ from services.status.core import StatusCore
 from services.status.page import PAGE
 from services.status.picture import render_png
 from services.status.report import Readiness, StatusReport
+from services.status.security import check_binding, require_viewer, secure
 
 _NO_STORE = {"Cache-Control": "no-store"}
 
@@ -92,8 +93,10 @@ class SharedStatus:
 
 
 def create_app(shared: SharedStatus) -> FastAPI:
-    """The HTTP application over a shared status."""
+    """The HTTP application over a shared status. Raises SecurityError."""
     app = FastAPI(title="PLGRIM status", version="1", description="What the robot does, and why.")
+    secure(app, shared.config)
+    viewer = [Depends(require_viewer)]
 
     @app.get("/healthz")
     def healthz() -> dict[str, str]:
@@ -107,17 +110,22 @@ def create_app(shared: SharedStatus) -> FastAPI:
         response.status_code = 503 if reasons else 200
         return Readiness(ready=not reasons, reasons=reasons)
 
-    @app.get("/api/v1/status")
+    @app.get("/api/v1/status", dependencies=viewer)
     def status() -> StatusReport:
         """Phase, pose, coverage, target and why, plan, and how every service is."""
         return shared.status()
 
-    @app.get("/map.png", response_class=Response, responses={200: {"content": {"image/png": {}}}})
+    @app.get(
+        "/map.png",
+        response_class=Response,
+        responses={200: {"content": {"image/png": {}}}},
+        dependencies=viewer,
+    )
     def map_png() -> Response:
         """The map as far as it is known, with the driven path, the plan and the target."""
         return Response(shared.picture_png(), media_type="image/png", headers=_NO_STORE)
 
-    @app.get("/metrics", response_class=Response, include_in_schema=False)
+    @app.get("/metrics", response_class=Response, include_in_schema=False, dependencies=viewer)
     def metrics() -> Response:
         """For Prometheus."""
         return Response(shared.metrics(), media_type=CONTENT_TYPE_LATEST)
@@ -138,11 +146,21 @@ class StatusServer:
     """Serves the application from a thread of its own."""
 
     def __init__(self, shared: SharedStatus) -> None:
-        """Binds the address at once: raises `PortTakenError` with what to change."""
+        """Binds the address at once: raises `PortTakenError` or `SecurityError` with what to change."""
         self.shared = shared
+        check_binding(shared.config)
         self._socket = _bind(shared.config.host, shared.config.port)
         self.port: int = self._socket.getsockname()[1]
-        settings = uvicorn.Config(create_app(shared), log_level="warning", ws="none", lifespan="off")
+        settings = uvicorn.Config(
+            create_app(shared),
+            log_level="warning",
+            ws="none",
+            lifespan="off",
+            server_header=False,
+            limit_concurrency=shared.config.max_connections,
+            ssl_certfile=shared.config.tls_certificate_file or None,
+            ssl_keyfile=shared.config.tls_key_file or None,
+        )
         self._server = uvicorn.Server(settings)
         self._thread = threading.Thread(target=self._serve, name="status-http", daemon=True)
 
