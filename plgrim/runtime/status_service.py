@@ -97,7 +97,8 @@ def _serve(
     server.shared.desk.send = lambda command: say(COMMAND, command)
     service.link.declare(COMMAND)
     service.link.serve(
-        command_key(service.config.robot), lambda payload: answer_json(server.shared.desk, payload)
+        command_key(service.config.robot),
+        lambda payload: answer_json(server.shared.desk, payload, server.shared.fences),
     )
     for topic in read_by("status"):
         service.link.subscribe(topic, feed.accept)

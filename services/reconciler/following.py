@@ -96,7 +96,12 @@ class Driven:
         if end != self.end:
             self.end, self.changed = end, True
             if hazard >= 0:
-                self.why = f"hazard {(hazard - self.at) * STEP_M:.1f} m ahead"
+                what = (
+                    "fence"
+                    if ground.is_shut(float(points[hazard, 0]), float(points[hazard, 1]), least_m)
+                    else "hazard"
+                )
+                self.why = f"{what} {(hazard - self.at) * STEP_M:.1f} m ahead"
 
     @staticmethod
     def _clearance_m(ground: Ground, at: NDArray[np.float64]) -> float:

@@ -66,7 +66,10 @@ GeoJsonIn = Annotated[
     PolygonIn | MultiPolygonIn | FeatureIn | FeatureCollectionIn, Field(discriminator="type")
 ]
 
-_SQUARE: dict[str, Any] = {"type": "Polygon", "coordinates": [[[2.0, 1.0], [6.0, 1.0], [6.0, 4.0], [2.0, 4.0], [2.0, 1.0]]]}
+_SQUARE: dict[str, Any] = {
+    "type": "Polygon",
+    "coordinates": [[[2.0, 1.0], [6.0, 1.0], [6.0, 4.0], [2.0, 4.0], [2.0, 1.0]]],
+}
 
 
 class FenceRequest(BaseModel):
