@@ -96,11 +96,8 @@ class Driven:
         if end != self.end:
             self.end, self.changed = end, True
             if hazard >= 0:
-                what = (
-                    "fence"
-                    if ground.is_shut(float(points[hazard, 0]), float(points[hazard, 1]), least_m)
-                    else "hazard"
-                )
+                x_m, y_m = points[hazard].tolist()
+                what = "fence" if ground.is_shut(x_m, y_m, least_m) else "hazard"
                 self.why = f"{what} {(hazard - self.at) * STEP_M:.1f} m ahead"
 
     @staticmethod
