@@ -1,4 +1,4 @@
-"""Whole missions in lock-step: fences drawn on the way are obeyed by the true robot, bound it, and can be taken away."""
+"""Whole missions in lock-step: fences drawn on the way are obeyed by the true robot, bound it, can be taken away."""
 
 from __future__ import annotations
 
