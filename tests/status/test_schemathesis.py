@@ -12,13 +12,13 @@ from services.status.config import Config
 from services.status.security import Access, Role, Token, _digest
 from tests.status.mission_behind import MissionBehind
 from tests.status.test_api import SECRET
-from tests.status.test_app import fill
+from tests.status.test_app import Clock, fill
 
 _HEADERS = {"Authorization": f"Bearer {SECRET}", "Host": "127.0.0.1:8080"}
 
 
 def _application() -> object:
-    shared = SharedStatus(Config(), "husky1")
+    shared = SharedStatus(Config(), "husky1", Clock())
     fill(shared)
     MissionBehind(shared)
     app = create_app(shared)
