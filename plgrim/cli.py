@@ -15,6 +15,7 @@ from plgrim.commands import (
     inspect,
     link,
     missions,
+    operator,
     record,
     report,
     services,
@@ -28,7 +29,20 @@ application = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_show_locals=False,
 )
-for room in (missions, services, link, doctor, record, report, foxglove, feed, evaluate, inspect, certs):
+for room in (
+    missions,
+    operator,
+    services,
+    link,
+    doctor,
+    record,
+    report,
+    foxglove,
+    feed,
+    evaluate,
+    inspect,
+    certs,
+):
     room.register(application)
 add_examples(application)
 

@@ -15,12 +15,18 @@ from plgrim.runtime.router import page_address
 from plgrim.runtime.service import LiveService
 from schemas.base import Message
 from schemas.contract import Output, Topic
-from schemas.topics import STATUS_GRAPH_REQUEST, read_by
+from schemas.topics import COMMAND, STATUS_GRAPH_REQUEST, read_by
 from services.status import app
+from services.status.commands import answer_json
 from services.status.config import Config as StatusConfig
 from services.status.security import SecurityError
 
 _TICK_S = 0.2
+
+
+def command_key(robot: str) -> str:
+    """Where commands are asked for over Zenoh: a query with the command as JSON, answered with the mission's answer."""
+    return f"plgrim/@v1/{robot}/mission/command"
 
 
 class StatusFeed:
@@ -57,6 +63,7 @@ def run_status(config: Config, stop: threading.Event) -> None:
     options = cast(StatusConfig, check_service(config, "status"))
     clock = MissionClock.of(config.clock)
     shared = app.SharedStatus(options, config.robot, clock.now_ns)
+    shared.configuration = config.model_dump(mode="json")
     try:
         server = app.StatusServer(shared)
     except app.PortTakenError as error:
@@ -81,6 +88,20 @@ def _serve(
     keeper: Keeper | None,
 ) -> None:
     outbox = Outbox(service.config.robot, "status", service.epoch)
+    sending = threading.Lock()
+
+    def say(topic: Topic[Message], message: Message) -> None:
+        """Publish, from any thread."""
+        with sending:
+            payload = outbox.pack(Output(topic, message), service.clock.now_ns(), {})
+            service.link.publish(topic, payload)
+
+    server.shared.desk.send = lambda command: say(COMMAND, command)
+    service.link.declare(COMMAND)
+    shared = server.shared
+    service.link.serve(
+        command_key(service.config.robot), lambda payload: answer_json(shared.desk, payload, shared.fences)
+    )
     for topic in read_by("status"):
         service.link.subscribe(topic, feed.accept)
     service.mailbox_report = feed.report
@@ -93,8 +114,7 @@ def _serve(
         now = service.clock.now_ns()
         request = server.shared.graph_request(now)
         if request is not None:
-            payload = outbox.pack(Output(STATUS_GRAPH_REQUEST, request), now, {})
-            service.link.publish(STATUS_GRAPH_REQUEST, payload)
+            say(STATUS_GRAPH_REQUEST, request)
         if keeper is not None:
             keeper.after_step(server.shared, now)
             service.monitor.degraded = keeper.trouble

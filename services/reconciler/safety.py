@@ -26,7 +26,8 @@ class SafetyInputs(NamedTuple):
     """What the machine looks at: ages of inputs in seconds (None: never came), and the mission's phase.
 
     in_the_way: somebody moves so near that the robot must stand (see `separation`). failed: services that the
-    supervisor could not keep alive. unsaved: services that cannot write their journals.
+    supervisor could not keep alive. unsaved: services that cannot write their journals. fences_missing: the mission has
+    fences that have not been heard of here.
     """
 
     risk_age_s: float | None
@@ -37,6 +38,7 @@ class SafetyInputs(NamedTuple):
     in_the_way: bool = False
     failed: tuple[str, ...] = ()
     unsaved: tuple[str, ...] = ()
+    fences_missing: bool = False
 
 
 class Verdict(NamedTuple):
@@ -59,6 +61,8 @@ def judge(limits: SafetyLimits, inputs: SafetyInputs) -> Verdict:
     asked += _supervised(inputs)
     if inputs.in_the_way:
         asked.append((SafetyState.HOLD, "somebody moves in the way"))
+    if inputs.fences_missing:
+        asked.append((SafetyState.HOLD, "the mission's fences have not come yet"))
     if not asked:
         return Verdict(SafetyState.RUN, "", True, False)
     state, reason = max(asked, key=lambda entry: _SEVERITY.index(entry[0]))

@@ -60,6 +60,9 @@ class Config(BaseModel):
         ),
         description="Topics without which the robot is not ready; stale ones count as missing.",
     )
+    command_timeout_s: float = Field(
+        3.0, gt=0, le=60, description="So long the mission's answer to a command is waited for, wall s."
+    )
     map_size_px: int = Field(
         1000, ge=64, le=4000, description="Longer side of the picture of the map, pixels."
     )

@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from planning.frames import Planar
-from planning.graph_mirror import FRONTIER, GraphMirror
+from planning.graph_mirror import FRONTIER, GraphMirror, RoadMap
 from planning.grid import GridSpec
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS
@@ -22,6 +22,8 @@ from schemas.topics import health_topic, topic_named
 from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest
 from services.status.canvas import TileCanvas
 from services.status.config import Config
+from services.status.events import EventLog
+from services.status.history import Curve, CurvePoint
 from services.status.picture import Picture
 from services.status.report import (
     CoverageReport,
@@ -58,6 +60,8 @@ class StatusCore:
         self.robot = robot
         self.canvas = TileCanvas()
         self.target_switches = 0
+        self.events = EventLog()
+        self.curve = Curve()
         self._seen: dict[str, _Seen] = {}
         self._trajectory: list[tuple[float, float]] = []
         self._mirror = GraphMirror()
@@ -67,6 +71,7 @@ class StatusCore:
     def observe(self, topic_name: str, message: Message, now_ns: int) -> None:
         """Take in one message. now_ns: local monotonic clock, the same one that the other calls are given."""
         self._note(topic_name, message, now_ns)
+        self.events.observe(message)
         if isinstance(message, Odometry):
             self._follow(message)
         elif isinstance(message, CoverageWindow):
@@ -77,6 +82,22 @@ class StatusCore:
             self.target_switches += message.switched
         elif isinstance(message, GlobalIrm):
             self._graph_fits = self._mirror.apply(message)
+        elif isinstance(message, CoverageSummary):
+            self._note_coverage(message)
+
+    def _note_coverage(self, summary: CoverageSummary) -> None:
+        state, judge = self._latest("mission/state", MissionState), self._latest("sim/judge", JudgeReport)
+        if state is not None:
+            seen = math.nan if judge is None else judge.coverage
+            self.curve.add(
+                CurvePoint(
+                    state.elapsed_s,
+                    summary.covered_fraction,
+                    summary.covered_area_m2,
+                    state.distance_m,
+                    seen,
+                )
+            )
 
     def _note(self, topic_name: str, message: Message, now_ns: int) -> None:
         seen = self._seen.get(topic_name)
@@ -148,6 +169,15 @@ class StatusCore:
         """The newest report of the link to the base; None when there is no link."""
         return self._latest("link/report", LinkReport)
 
+    @property
+    def graph(self) -> tuple[int, RoadMap]:
+        """Version and content of the Global IRM as far as it is known here; version 0: nothing yet."""
+        return self._mirror.version, self._mirror.road_map()
+
+    def latest(self, topic_name: str, kind: type[_M]) -> _M | None:
+        """The newest message of a topic, or None when none has come."""
+        return self._latest(topic_name, kind)
+
     def _latest(self, topic_name: str, kind: type[_M]) -> _M | None:
         seen = self._seen.get(topic_name)
         return seen.message if seen is not None and isinstance(seen.message, kind) else None
@@ -172,6 +202,7 @@ class StatusCore:
             distance_m=state.distance_m,
             return_distance_m=state.return_distance_m,
             left=len(state.left),
+            fences_version=state.fences_version,
         )
 
     def _coverage(self, judge: JudgeReport | None) -> CoverageReport | None:
@@ -275,7 +306,14 @@ class StatusCore:
         """What messages will not tell again: the map, the trajectory, how often the target was switched."""
         trajectory = np.array(self._trajectory, dtype=np.float64).reshape(-1, 2)
         return pack_snapshot(
-            {"canvas": self.canvas.state(), "trajectory": trajectory, "target_switches": self.target_switches}
+            {
+                "canvas": self.canvas.state(),
+                "trajectory": trajectory,
+                "target_switches": self.target_switches,
+                "events": self.events.state(),
+                "curve": [list(point) for point in self.curve.points],
+                "curve_spacing_s": self.curve.spacing_s,
+            }
         )
 
     def restore(self, snapshot: bytes) -> None:
@@ -284,6 +322,10 @@ class StatusCore:
         self.canvas.set_state(state["canvas"])
         self._trajectory = [(float(x), float(y)) for x, y in state["trajectory"]]
         self.target_switches = int(state["target_switches"])
+        if "events" in state:  # older snapshots have none
+            self.events.set_state(state["events"])
+            self.curve.points = [CurvePoint(*point) for point in state["curve"]]
+            self.curve.spacing_s = state["curve_spacing_s"]
 
     def numbers(self, now_ns: int) -> Mapping[str, float]:
         """The numbers of the status by name, for metrics; only what is known."""
@@ -291,6 +333,7 @@ class StatusCore:
         found: dict[str, float | None] = {
             "ready": float(report.ready),
             "target_switches": float(report.target_switches),
+            "events_total": float(self.events.last_id),
         }
         if report.coverage is not None:
             found |= {
