@@ -5,6 +5,7 @@ The page at `/` and all answers need nothing from elsewhere; only `/docs` loads 
 
 from __future__ import annotations
 
+import math
 import socket
 import threading
 import time
@@ -12,17 +13,21 @@ from collections.abc import Callable
 
 import uvicorn
 from fastapi import FastAPI, Response
-from fastapi.responses import HTMLResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
 
 from schemas.base import Message
 from schemas.world import GraphRequest
+from services.status.board import Board
 from services.status.config import Config
 from services.status.core import StatusCore
-from services.status.page import PAGE
+from services.status.live import Painter
+from services.status.live_socket import add_live
+from services.status.page import add_page
 from services.status.picture import render_png
 from services.status.report import Readiness, StatusReport
+from services.status.view import View
 
+_REPORT_S = 0.5
 _NO_STORE = {"Cache-Control": "no-store"}
 
 
@@ -71,6 +76,11 @@ class SharedStatus:
             picture = self._core.picture()
         return render_png(picture, self.config.map_size_px)
 
+    def view(self, tiles_since: int, with_report: bool) -> View:
+        """See `StatusCore.view`."""
+        with self._lock:
+            return self._core.view(self._now_ns(), tiles_since, with_report)
+
     def metrics(self) -> bytes:
         """Prometheus text: the numbers of the mission, and of every service its rate, step time and
         errors.
@@ -89,6 +99,27 @@ class SharedStatus:
             for reason, count in stage.dropped.items():
                 dropped.labels(stage.service, reason).set(count)
         return generate_latest(registry)
+
+
+class LiveStatus:
+    """Draws the shared status onto a board for the live page. Report and curves at most every `_REPORT_S`."""
+
+    def __init__(self, shared: SharedStatus) -> None:
+        self._shared = shared
+        self._painter = Painter()
+        self._reported_s = -math.inf
+
+    @property
+    def board(self) -> Board:
+        """What browsers are sent."""
+        return self._painter.board
+
+    def tick(self) -> None:
+        """Draw what has changed."""
+        now_s = time.monotonic()
+        due = now_s - self._reported_s >= _REPORT_S
+        self._reported_s = now_s if due else self._reported_s
+        self._painter.paint(self._shared.view(self._painter.pastes, due))
 
 
 def create_app(shared: SharedStatus) -> FastAPI:
@@ -122,11 +153,8 @@ def create_app(shared: SharedStatus) -> FastAPI:
         """For Prometheus."""
         return Response(shared.metrics(), media_type=CONTENT_TYPE_LATEST)
 
-    @app.get("/", response_class=HTMLResponse, include_in_schema=False)
-    def page() -> str:
-        """A plain page: the map and the status, renewed each second."""
-        return PAGE
-
+    add_live(app, LiveStatus(shared))
+    add_page(app)
     return app
 
 
@@ -142,7 +170,7 @@ class StatusServer:
         self.shared = shared
         self._socket = _bind(shared.config.host, shared.config.port)
         self.port: int = self._socket.getsockname()[1]
-        settings = uvicorn.Config(create_app(shared), log_level="warning", ws="none", lifespan="off")
+        settings = uvicorn.Config(create_app(shared), log_level="warning", ws="websockets-sansio", ws_per_message_deflate=False, lifespan="off")
         self._server = uvicorn.Server(settings)
         self._thread = threading.Thread(target=self._serve, name="status-http", daemon=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
@@ -19,9 +20,11 @@ from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import health_topic, topic_named
-from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest
+from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest, LocalIrm, RiskMap
 from services.status.canvas import TileCanvas
 from services.status.config import Config
+from services.status.history import History
+from services.status.parts import path_xy
 from services.status.picture import Picture
 from services.status.report import (
     CoverageReport,
@@ -33,8 +36,10 @@ from services.status.report import (
     TargetReport,
     TopicReport,
 )
+from services.status.view import NO_POINTS, View
 
 _RATE_SMOOTHING = 0.2
+_NEW_END_M = 0.75
 _M = TypeVar("_M", bound=Message)
 
 
@@ -58,6 +63,10 @@ class StatusCore:
         self.robot = robot
         self.canvas = TileCanvas()
         self.target_switches = 0
+        self.history = History()
+        self._old_path = NO_POINTS
+        self._pids: dict[str, int] = {}
+        self._restarts: Counter[str] = Counter()
         self._seen: dict[str, _Seen] = {}
         self._trajectory: list[tuple[float, float]] = []
         self._mirror = GraphMirror()
@@ -66,6 +75,10 @@ class StatusCore:
 
     def observe(self, topic_name: str, message: Message, now_ns: int) -> None:
         """Take in one message. now_ns: local monotonic clock, the same one that the other calls are given."""
+        if isinstance(message, Plan):
+            self._keep_old_path(message)
+        elif isinstance(message, StageHealth):
+            self._count_restarts(message)
         self._note(topic_name, message, now_ns)
         if isinstance(message, Odometry):
             self._follow(message)
@@ -77,6 +90,32 @@ class StatusCore:
             self.target_switches += message.switched
         elif isinstance(message, GlobalIrm):
             self._graph_fits = self._mirror.apply(message)
+        elif isinstance(message, MissionState) and self.history.due(message.elapsed_s):
+            self._sample(message)
+
+    def _keep_old_path(self, plan: Plan) -> None:
+        """The path that a new policy replaces: the end of the new one does not lie on it."""
+        last = self._latest("reconciler/plan", Plan)
+        if last is None or not last.valid or not plan.valid:
+            return
+        gaps = np.hypot(last.x_m - plan.x_m[-1], last.y_m - plan.y_m[-1])
+        if float(gaps.min()) > _NEW_END_M:
+            self._old_path = path_xy(last)
+
+    def _count_restarts(self, health: StageHealth) -> None:
+        if self._pids.get(health.service, health.pid) != health.pid:
+            self._restarts[health.service] += 1
+        self._pids[health.service] = health.pid
+
+    def _sample(self, state: MissionState) -> None:
+        judge = self._latest("sim/judge", JudgeReport)
+        steps = {
+            seen.message.service: seen.message.step_p50_ms
+            for seen in self._seen.values()
+            if isinstance(seen.message, StageHealth)
+        }
+        found = None if judge is None else judge.coverage
+        self.history.add(state.elapsed_s, state.coverage, found, state.distance_m, steps)
 
     def _note(self, topic_name: str, message: Message, now_ns: int) -> None:
         seen = self._seen.get(topic_name)
@@ -255,6 +294,31 @@ class StatusCore:
             title=self._title(),
         )
 
+    def view(self, now_ns: int, tiles_since: int, with_report: bool) -> View:
+        """What the live page shows, to be drawn outside the lock: nothing in it changes any more.
+
+        tiles_since: tiles of the canvas that changed after this number are copied. with_report: make the report too.
+        """
+        place, (pastes, tiles) = self._pose(), self.canvas.changed(tiles_since)
+        return View(
+            odometry=self._latest("sim/odometry", Odometry),
+            place=None if place is None else (place.x_m, place.y_m, place.yaw_rad),
+            risk=self._latest("riskmap/risk_map", RiskMap),
+            local=self._latest("irm/local_irm", LocalIrm),
+            policy=self._latest("gcp/global_policy", GlobalPolicy),
+            plan=self._latest("reconciler/plan", Plan),
+            old_path=self._old_path,
+            graph=self._mirror.road_map(),
+            pastes=pastes,
+            tiles=tiles,
+            tile_names=self.canvas.tiles(),
+            resolution_m=self.canvas.resolution_m,
+            trajectory=self._trajectory.copy(),
+            history=self.history.rows() if with_report else None,
+            report=self.status(now_ns) if with_report else None,
+            restarts=dict(self._restarts),
+        )
+
     def _plan_in_map(self) -> tuple[tuple[float, float], ...]:
         plan, odometry = self._latest("reconciler/plan", Plan), self._latest("sim/odometry", Odometry)
         if plan is None or odometry is None or not plan.valid:
@@ -271,7 +335,12 @@ class StatusCore:
         """What messages will not tell again: the map, the trajectory, how often the target was switched."""
         trajectory = np.array(self._trajectory, dtype=np.float64).reshape(-1, 2)
         return pack_snapshot(
-            {"canvas": self.canvas.state(), "trajectory": trajectory, "target_switches": self.target_switches}
+            {
+                "canvas": self.canvas.state(),
+                "trajectory": trajectory,
+                "target_switches": self.target_switches,
+                "history": self.history.state(),
+            }
         )
 
     def restore(self, snapshot: bytes) -> None:
@@ -280,6 +349,8 @@ class StatusCore:
         self.canvas.set_state(state["canvas"])
         self._trajectory = [(float(x), float(y)) for x, y in state["trajectory"]]
         self.target_switches = int(state["target_switches"])
+        if "history" in state:
+            self.history.set_state(state["history"])
 
     def numbers(self, now_ns: int) -> Mapping[str, float]:
         """The numbers of the status by name, for metrics; only what is known."""
