@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import time
 from collections import deque
 from typing import Any, Protocol
@@ -18,6 +19,7 @@ from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 
 from services.status.board import Board
 
+_LOG = logging.getLogger(__name__)
 LIVE_PATH = "/api/v1/live"
 TICK_S = 0.1
 _UNDERWAY = 2
@@ -62,7 +64,10 @@ class Ticker:
     async def _run(self) -> None:
         while True:
             began = time.monotonic()
-            await asyncio.to_thread(self.source.tick)
+            try:
+                await asyncio.to_thread(self.source.tick)
+            except Exception:  # one state that cannot be drawn must not end the page
+                _LOG.exception("the live state was not drawn")
             self._drawn.set()
             self._drawn = asyncio.Event()
             await asyncio.sleep(max(self._tick_s - (time.monotonic() - began), 0.01))
@@ -138,7 +143,7 @@ def add_live(app: FastAPI, source: LiveSource, dependencies: list[Any] | None = 
             async with ticker:
                 await watcher.greet()
                 await _first(watcher.listen(), watcher.tell(ticker))
-        with contextlib.suppress(RuntimeError):  # it has gone by itself
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):  # it has gone by itself
             await socket.close(1001)
 
 
