@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from schemas.base import Array, Header, Message, Pose, column
+from schemas.fences import MAX_FENCES, Fence
 
 
 class MissionPhase(StrEnum):
@@ -43,9 +44,13 @@ class LeftOver(Header):
 
 
 class MissionState(Message):
-    """The mission's one truth. elapsed_s counts from the start command, pauses included."""
+    """The mission's one truth. elapsed_s counts from the start command, pauses included.
+
+    fences_version: of the fences that hold now (`mission/fences`); who has others must not move the robot.
+    """
 
     schema_name: ClassVar[str] = "mission_state"
+    schema_version: ClassVar[int] = 2
 
     phase: MissionPhase
     finish: FinishReason
@@ -57,25 +62,59 @@ class MissionState(Message):
     home: Pose
     coverage: float = Field(ge=0, le=1)
     left: list[LeftOver]
+    fences_version: int = Field(0, ge=0)
 
 
 class CommandKind(StrEnum):
-    """What an operator may ask of the mission."""
+    """What an operator may ask of the mission.
+
+    budget: another time budget. fence: add polygons; a geofence replaces the one before, and a polygon with the id of
+    one that there is replaces that one. unfence: take polygons away.
+    """
 
     START = "start"
     PAUSE = "pause"
     RESUME = "resume"
     HOME = "home"
     STOP = "stop"
+    BUDGET = "budget"
+    FENCE = "fence"
+    UNFENCE = "unfence"
 
 
 class MissionCommand(Message):
-    """A command. command_id: repeated commands with the same id are carried out once."""
+    """A command. command_id: repeated commands with the same id are carried out once, and answered alike.
+
+    time_budget_s: for `budget`, mission time from start to end (0: none). fences: for `fence`. fence_ids: for
+    `unfence`; empty: all.
+    """
 
     schema_name: ClassVar[str] = "mission_command"
+    schema_version: ClassVar[int] = 2
 
     command_id: str = Field(min_length=1, max_length=64)
     kind: CommandKind
+    time_budget_s: float = Field(0.0, ge=0, le=1e9)
+    fences: list[Fence] = Field(default_factory=list, max_length=MAX_FENCES)
+    fence_ids: list[str] = Field(default_factory=list, max_length=MAX_FENCES)
+
+
+class CommandAnswer(Message):
+    """What became of a command: one for every command received, for a repeated one the same as before.
+
+    reason: in plain words. phase: of the mission after it. fence_ids: of the polygons that it added, replaced or took
+    away. fences_version: of the fences after it.
+    """
+
+    schema_name: ClassVar[str] = "command_answer"
+
+    command_id: str = Field(min_length=1, max_length=64)
+    kind: CommandKind
+    accepted: bool
+    reason: str
+    phase: MissionPhase
+    fence_ids: list[str]
+    fences_version: int = Field(ge=0)
 
 
 class StageHealth(Message):

@@ -6,7 +6,15 @@ from typing import Any
 
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Topic
-from schemas.operation import JudgeReport, MissionCommand, MissionState, StageHealth, WorldPicture
+from schemas.fences import Fences
+from schemas.operation import (
+    CommandAnswer,
+    JudgeReport,
+    MissionCommand,
+    MissionState,
+    StageHealth,
+    WorldPicture,
+)
 from schemas.policy import EpisodeRequest, GlobalPolicy, LocalPolicy, Plan
 from schemas.sensing import CoverageScan, FollowerState, Odometry, PointCloud, PoseGraph, ReadyGrid
 from schemas.world import (
@@ -141,15 +149,23 @@ MISSION: Topic[MissionState] = _topic(
     MissionState, "mission/state", "irm gcp lcp reconciler status sim", "phase, budget, finish reason",
     period_ms=500, stale_ms=3000, link=True, journaled=True,
 )  # fmt: skip
+FENCES: Topic[Fences] = _topic(
+    Fences, "mission/fences", "irm reconciler status", "geofence, no-go and priority polygons", period_ms=2000,
+    max_bytes=4 * _MIB, link=True, journaled=True,
+)  # fmt: skip
+ANSWER: Topic[CommandAnswer] = _topic(
+    CommandAnswer, "mission/answer", "status", "what became of a command", period_ms=0, keep_all=True,
+    max_bytes=16 * _KIB, link=True, journaled=True,
+)  # fmt: skip
 COMMAND: Topic[MissionCommand] = _topic(
     MissionCommand, "status/command", "mission", "what the operator asks", period_ms=0, keep_all=True,
-    max_bytes=4 * _KIB, link=True,
+    max_bytes=1024 * _KIB, link=True,
 )  # fmt: skip
 
 TOPICS: tuple[Topic[Message], ...] = (
     CLOUD, READY_GRID, ODOMETRY, POSE_GRAPH, COVERAGE_SCAN, FOLLOWER, JUDGE, WORLD_PICTURE, RISK_MAP, MOVING, LOCAL_IRM,
     GLOBAL_IRM, COVERAGE, COVERAGE_WINDOW, GLOBAL_POLICY, GCP_GRAPH_REQUEST, MISSION_GRAPH_REQUEST,
-    STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, MISSION, COMMAND,
+    STATUS_GRAPH_REQUEST, EPISODE, LOCAL_POLICY, PLAN, FENCES, MISSION, ANSWER, COMMAND,
 )  # fmt: skip
 """All topics of the stages. Health topics come on top: `health_topic`."""
 

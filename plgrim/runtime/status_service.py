@@ -6,7 +6,7 @@ import threading
 from typing import cast
 
 from plgrim.config import Config, check_service
-from plgrim.errors import PortTakenError
+from plgrim.errors import ConfigError, PortTakenError
 from plgrim.logs import get_logger
 from plgrim.runtime.clock import MissionClock
 from plgrim.runtime.keeper import Keeper
@@ -15,11 +15,18 @@ from plgrim.runtime.router import page_address
 from plgrim.runtime.service import LiveService
 from schemas.base import Message
 from schemas.contract import Output, Topic
-from schemas.topics import STATUS_GRAPH_REQUEST, read_by
+from schemas.topics import COMMAND, STATUS_GRAPH_REQUEST, read_by
 from services.status import app
+from services.status.commands import answer_json
 from services.status.config import Config as StatusConfig
+from services.status.security import SecurityError
 
 _TICK_S = 0.2
+
+
+def command_key(robot: str) -> str:
+    """Where commands are asked for over Zenoh: a query with the command as JSON, answered with the mission's answer."""
+    return f"plgrim/@v1/{robot}/mission/command"
 
 
 class StatusFeed:
@@ -54,10 +61,13 @@ def run_status(config: Config, stop: threading.Event) -> None:
     options = cast(StatusConfig, check_service(config, "status"))
     clock = MissionClock.of(config.clock)
     shared = app.SharedStatus(options, config.robot, clock.now_ns)
+    shared.configuration = config.model_dump(mode="json")
     try:
         server = app.StatusServer(shared)
     except app.PortTakenError as error:
         raise PortTakenError(f"{error} in the configuration, or PLGRIM_STATUS__PORT") from error
+    except (SecurityError, OSError) as error:
+        raise ConfigError(f"status: {error}") from error
     try:
         with LiveService("status", config, stop) as service:
             keeper = Keeper.of(config.runtime, config.robot, "status")
@@ -76,6 +86,19 @@ def _serve(
     keeper: Keeper | None,
 ) -> None:
     outbox = Outbox(service.config.robot, "status", service.epoch)
+    sending = threading.Lock()
+
+    def say(topic: Topic[Message], message: Message) -> None:
+        """Publish, from any thread."""
+        with sending:
+            payload = outbox.pack(Output(topic, message), service.clock.now_ns(), {})
+            service.link.publish(topic, payload)
+
+    server.shared.desk.send = lambda command: say(COMMAND, command)
+    service.link.declare(COMMAND)
+    service.link.serve(
+        command_key(service.config.robot), lambda payload: answer_json(server.shared.desk, payload)
+    )
     for topic in read_by("status"):
         service.link.subscribe(topic, feed.accept)
     service.mailbox_report = feed.report
@@ -87,8 +110,7 @@ def _serve(
         now = service.clock.now_ns()
         request = server.shared.graph_request(now)
         if request is not None:
-            payload = outbox.pack(Output(STATUS_GRAPH_REQUEST, request), now, {})
-            service.link.publish(STATUS_GRAPH_REQUEST, payload)
+            say(STATUS_GRAPH_REQUEST, request)
         if keeper is not None:
             keeper.after_step(server.shared, now)
         service.monitor.step_ended()

@@ -207,9 +207,24 @@ class Link:
         self._keep.append(queryable)
         self._spawn(f"query {key}", queryable.handler, lambda q: q.reply(q.key_expr, reply()))
 
-    def ask(self, key: str, timeout_s: float) -> bytes | None:
+    def serve(self, key: str, reply: Callable[[bytes], bytes]) -> None:
+        """Answer every query on a key with `reply(payload)`, each from a thread of its own: a reply may take long."""
+        queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(16))
+        self._keep.append(queryable)
+
+        def work(query: Any) -> None:
+            payload = b"" if query.payload is None else query.payload.to_bytes()
+            query.reply(query.key_expr, reply(payload))
+            del query
+
+        def spawn(query: Any) -> None:
+            threading.Thread(target=work, args=(query,), name=f"serve {key}", daemon=True).start()
+
+        self._spawn(f"serve {key}", queryable.handler, spawn)
+
+    def ask(self, key: str, timeout_s: float, payload: bytes | None = None) -> bytes | None:
         """The first good answer to a query, or None: nobody there, refused, or no answer in time."""
-        for reply in self.session.get(key, timeout=timeout_s):
+        for reply in self.session.get(key, timeout=timeout_s, payload=payload):
             if reply.ok is not None:
                 return reply.ok.payload.to_bytes()
         return None
@@ -245,7 +260,13 @@ def _drain(handler: Any, work: Callable[[Any], None], name: str) -> None:
 def _priority(topic: Topic[Message]) -> zenoh.Priority:
     if topic.max_bytes > _LARGE_BYTES:
         return zenoh.Priority.DATA_LOW
-    if topic.name in ("reconciler/plan", "status/command", "mission/state"):
+    if topic.name in (
+        "reconciler/plan",
+        "status/command",
+        "mission/state",
+        "mission/fences",
+        "mission/answer",
+    ):
         return zenoh.Priority.INTERACTIVE_HIGH
     return zenoh.Priority.DATA
 

@@ -47,6 +47,9 @@ class Config(BaseModel):
     progress_min_m: float = Field(
         1.0, gt=0, description="On the way back: so much less of the way left counts as progress, m."
     )
+    fences_period_s: float = Field(
+        2.0, gt=0, le=60, description="The fences are told at every change and so often, s."
+    )
     ask_again_s: float = Field(2.0, gt=0, le=60, description="Time between requests for the whole graph, s.")
     max_left: int = Field(
         200, ge=1, le=1000, description="At most so many left-over places are reported, best first."

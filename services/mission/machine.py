@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 from schemas.contract import SECOND_NS
 from schemas.operation import CommandKind, FinishReason, MissionPhase
@@ -38,12 +38,19 @@ class Facts:
     commands: tuple[tuple[str, CommandKind], ...] = ()
 
 
+class Outcome(NamedTuple):
+    """What became of a command, in plain words."""
+
+    accepted: bool
+    reason: str
+
+
 @dataclass(slots=True)
 class Machine:
     """Phase, finish reason and the timers behind them; all times in mission-clock ns, -1 for not yet.
 
     paused_phase: the phase to resume. pending: why the robot is on its way home. start_m: distance at the
-    start.
+    start. time_budget_s: the configured one, or the operator's; 0: none.
     """
 
     config: Config
@@ -60,7 +67,12 @@ class Machine:
     idle_ns: int = 0
     best_area_m2: float = 0.0
     best_return_m: float = math.inf
+    time_budget_s: float = -1.0
     seen: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.time_budget_s < 0:
+            self.time_budget_s = self.config.time_budget_s
 
     def step(self, facts: Facts) -> None:
         """Take in the facts and move on.
@@ -68,7 +80,7 @@ class Machine:
         Commands first, then the way home, then what ends the exploration.
         """
         for command_id, kind in facts.commands:
-            self._command(command_id, kind, facts)
+            self.command(command_id, kind, facts)
         if self.phase == MissionPhase.IDLE:
             self._idle(facts)
         if self.phase == MissionPhase.RETURN:
@@ -84,31 +96,79 @@ class Machine:
         end_ns = self.finished_ns if self.finished_ns >= 0 else now_ns
         return (end_ns - self.started_ns) / SECOND_NS
 
-    def _command(self, command_id: str, kind: CommandKind, facts: Facts) -> None:
-        """Carry out a command once; one that does not fit the phase changes nothing."""
+    def command(self, command_id: str, kind: CommandKind, facts: Facts) -> Outcome:
+        """Carry out a command once; one that does not fit the phase changes nothing, and says why."""
         if command_id in self.seen:
-            return
+            return Outcome(False, "carried out before")
         self.seen = [*self.seen, command_id][-_REMEMBERED_COMMANDS:]
         if self.phase in _OVER:
-            return
+            return Outcome(False, f"the mission is over ({self.finish.value})")
+        before = self.phase
         if kind == CommandKind.STOP:
             self._end(MissionPhase.STOPPED, FinishReason.STOPPED, "stopped by the operator", facts)
-        elif kind == CommandKind.START and self.phase == MissionPhase.IDLE:
-            self._start(facts, "started by the operator")
-        elif kind == CommandKind.PAUSE and self.phase in (MissionPhase.EXPLORE, MissionPhase.RETURN):
+        elif kind == CommandKind.START:
+            return self._start_asked(facts)
+        elif kind == CommandKind.PAUSE:
+            if self.phase not in (MissionPhase.EXPLORE, MissionPhase.RETURN):
+                return Outcome(False, f"nothing to pause: the mission is {before.value}")
             self.paused_phase, self.phase = self.phase, MissionPhase.PAUSED
             self.reason = "paused by the operator"
-        elif kind == CommandKind.RESUME and self.phase == MissionPhase.PAUSED:
+        elif kind == CommandKind.RESUME:
+            if self.phase != MissionPhase.PAUSED:
+                return Outcome(False, f"nothing to resume: the mission is {before.value}")
             self._resume(facts)
         elif kind == CommandKind.HOME:
-            self._home(facts)
+            return self._home(facts)
+        return Outcome(True, f"{self.reason}; {self.phase.value} after {before.value}")
 
-    def _home(self, facts: Facts) -> None:
+    def _start_asked(self, facts: Facts) -> Outcome:
+        if self.phase != MissionPhase.IDLE:
+            return Outcome(False, f"started already: the mission is {self.phase.value}")
+        if not facts.localised:
+            return Outcome(False, "cannot start: there is no odometry yet")
+        self._start(facts, "started by the operator")
+        return Outcome(True, self.reason)
+
+    def _home(self, facts: Facts) -> Outcome:
         """Go home; a robot that is on its way already keeps the reason for which it turned back."""
         if self.phase == MissionPhase.PAUSED and self.paused_phase == MissionPhase.RETURN:
             self._resume(facts)
-        elif self.phase in (MissionPhase.EXPLORE, MissionPhase.PAUSED):
-            self._go_home(FinishReason.RETURNED, "sent home by the operator", facts)
+            return Outcome(True, "goes on its way home")
+        if self.phase == MissionPhase.RETURN:
+            return Outcome(True, f"on its way home already: {self.reason}")
+        if self.phase not in (MissionPhase.EXPLORE, MissionPhase.PAUSED):
+            return Outcome(False, f"not under way: the mission is {self.phase.value}")
+        self._go_home(FinishReason.RETURNED, "sent home by the operator", facts)
+        return Outcome(True, f"{self.reason}, {facts.return_distance_m:.0f} m")
+
+    def set_time_budget(self, time_budget_s: float, facts: Facts) -> Outcome:
+        """Another time budget, counted from the start (0: none). With more of it a robot that turned back for its time
+        goes on exploring; the next step turns it back again when it does not suffice."""
+        if self.phase in _OVER:
+            return Outcome(False, f"the mission is over ({self.finish.value})")
+        before, self.time_budget_s = self.time_budget_s, time_budget_s
+        was = f"{before:g} s" if before else "none"
+        now = f"{time_budget_s:g} s" if time_budget_s else "none"
+        text = f"time budget {now} (was {was}), {self.elapsed_s(facts.now_ns):.0f} s are spent"
+        more = time_budget_s == 0 or 0 < before < time_budget_s
+        if (
+            more
+            and self.pending == FinishReason.TIME_BUDGET
+            and MissionPhase.RETURN in (self.phase, self._held())
+        ):
+            self.pending = FinishReason.NONE
+            if self.phase == MissionPhase.PAUSED:
+                self.paused_phase = MissionPhase.EXPLORE
+            else:
+                self.phase, self.reason = MissionPhase.EXPLORE, "the time budget was raised"
+                self.idle_ns = 0
+                self._restart_timers(facts)
+            text += "; it explores on"
+        return Outcome(True, text)
+
+    def _held(self) -> MissionPhase:
+        """The phase that is paused, else the phase."""
+        return self.paused_phase if self.phase == MissionPhase.PAUSED else self.phase
 
     def _idle(self, facts: Facts) -> None:
         if not facts.localised:
@@ -182,9 +242,9 @@ class Machine:
             self._end_or_go_home(FinishReason.COVERED, reason, self.config.return_when_done, facts)
 
     def _check_time(self, facts: Facts) -> None:
-        if self.config.time_budget_s == 0:
+        if self.time_budget_s == 0:
             return
-        left_s = self.config.time_budget_s - self.elapsed_s(facts.now_ns)
+        left_s = self.time_budget_s - self.elapsed_s(facts.now_ns)
         self._check_budget(FinishReason.TIME_BUDGET, left_s, 1.0 / self.config.return_speed_mps, "s", facts)
 
     def _check_energy(self, facts: Facts) -> None:

@@ -11,15 +11,33 @@ from numpy.typing import NDArray
 from planning.coverage import LOG_2
 from planning.frames import Planar
 from planning.graph_mirror import FRONTIER, GraphMirror, RoadMap
-from schemas.base import Pose
-from schemas.contract import SECOND_NS, Inputs, Outputs, Stage, StageSetup, StageSpec, Stamp, outputs
-from schemas.operation import LeftOver, MissionPhase, MissionState
+from schemas.base import Message, Pose
+from schemas.contract import SECOND_NS, Inputs, Outputs, Stage, StageSetup, StageSpec, Stamp, Topic, outputs
+from schemas.operation import (
+    CommandAnswer,
+    CommandKind,
+    LeftOver,
+    MissionCommand,
+    MissionPhase,
+    MissionState,
+)
 from schemas.sensing import Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
-from schemas.topics import COMMAND, COVERAGE, GLOBAL_IRM, MISSION, MISSION_GRAPH_REQUEST, ODOMETRY
+from schemas.topics import (
+    ANSWER,
+    COMMAND,
+    COVERAGE,
+    FENCES,
+    GLOBAL_IRM,
+    MISSION,
+    MISSION_GRAPH_REQUEST,
+    ODOMETRY,
+)
 from schemas.world import CoverageSummary, GraphRequest
 from services.mission.config import Config
+from services.mission.fences import FenceBook, Whereabouts
 from services.mission.machine import Facts, Machine
+from services.mission.orders import OrderBook
 
 __all__ = ["Config", "MissionStage", "create", "spec", "warm_up"]
 
@@ -58,8 +76,12 @@ class MissionStage:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.machine = Machine(config)
+        self.fences = FenceBook()
+        self._orders = OrderBook()
+        self._fences_told: tuple[int, Stamp] = (-1, 0)
         self._mirror = GraphMirror()
         self._home: Pose | None = None
+        self._frame = Planar(0.0, 0.0, 0.0)
         self._at: Pose | None = None
         self._last_xy: tuple[float, float] | None = None
         self._distance_m = 0.0
@@ -69,7 +91,8 @@ class MissionStage:
         self._ways = _NO_WAYS
 
     def step(self, now: Stamp, inputs: Inputs) -> Outputs:
-        """One step: the mission's state, and a request for the graph when a difference was missed."""
+        """One step: the mission's state, its fences now and then, an answer to each command, and a request for the
+        graph when a difference was missed."""
         odometry = inputs.current(ODOMETRY)
         if odometry is not None:
             self._track(odometry)
@@ -80,14 +103,62 @@ class MissionStage:
             self._unreachable = _unreachable(coverage)
         left = self._left()
         return_m = self._return_distance_m()
-        self.machine.step(self._facts(now, inputs, coverage, return_m, len(left)))
-        state = self._state(now, return_m, left)
-        requests = [(MISSION_GRAPH_REQUEST, GraphRequest(stamp_ns=now, have_version=self._mirror.version))]
-        return outputs([(MISSION, state), *(requests if asks else [])])
+        facts = self._facts(now, coverage, return_m, len(left))
+        answers = [self._obey(now, received.message, facts) for received in inputs.new(COMMAND)]
+        self.machine.step(facts)
+        found: list[tuple[Topic[Message], Message]] = []
+        if self._fences_due(now):  # before the state that names their version
+            found.append((FENCES, self.fences.message(now)))
+        found.append((MISSION, self._state(now, return_m, left)))
+        found += [(ANSWER, answer) for answer in answers]
+        if asks:
+            found.append(
+                (MISSION_GRAPH_REQUEST, GraphRequest(stamp_ns=now, have_version=self._mirror.version))
+            )
+        return outputs(found)
+
+    def _obey(self, now: Stamp, command: MissionCommand, facts: Facts) -> CommandAnswer:
+        """Carry out a command, once, and say what became of it."""
+        known = self._orders.before(command, now, self.machine.phase, self.fences.version)
+        if known is not None:
+            return known
+        ids: list[str] = []
+        if command.kind == CommandKind.BUDGET:
+            outcome = self.machine.set_time_budget(command.time_budget_s, facts)
+        elif command.kind == CommandKind.FENCE:
+            outcome, ids = self.fences.add(command.fences, self._whereabouts())
+        elif command.kind == CommandKind.UNFENCE:
+            outcome, ids = self.fences.remove(command.fence_ids)
+        else:
+            outcome = self.machine.command(command.command_id, command.kind, facts)
+        answer = CommandAnswer(
+            stamp_ns=now,
+            command_id=command.command_id,
+            kind=command.kind,
+            accepted=outcome.accepted,
+            reason=outcome.reason,
+            phase=self.machine.phase,
+            fence_ids=ids,
+            fences_version=self.fences.version,
+        )
+        self._orders.keep(command, answer)
+        return answer
+
+    def _whereabouts(self) -> Whereabouts:
+        robot = None if self._at is None else _xy(self._at)
+        return Whereabouts(robot, self._home, self._frame)
+
+    def _fences_due(self, now: Stamp) -> bool:
+        version, told_ns = self._fences_told
+        if version == self.fences.version and now - told_ns < self.config.fences_period_s * SECOND_NS:
+            return False
+        self._fences_told = (self.fences.version, now)
+        return True
 
     def _track(self, odometry: Odometry) -> None:
         """Follow the robot: distance in `odom`, where nothing jumps; place and home in `map`."""
-        pose = odometry.pose
+        pose, frame = odometry.pose, odometry.map_to_odom
+        self._frame = Planar(frame.x_m, frame.y_m, frame.yaw_rad)
         self._at = _in_map(odometry)
         if self._home is None:
             self._home = self._at
@@ -106,10 +177,7 @@ class MissionStage:
         self._asked_ns = now
         return True
 
-    def _facts(
-        self, now: Stamp, inputs: Inputs, coverage: CoverageSummary | None, return_m: float, left: int
-    ) -> Facts:
-        commands = tuple((c.message.command_id, c.message.kind) for c in inputs.new(COMMAND))
+    def _facts(self, now: Stamp, coverage: CoverageSummary | None, return_m: float, left: int) -> Facts:
         return Facts(
             now_ns=now,
             localised=self._home is not None,
@@ -119,7 +187,6 @@ class MissionStage:
             settled=None if coverage is None else self._settled(coverage),
             covered_area_m2=None if coverage is None else coverage.covered_area_m2,
             left=left,
-            commands=commands,
         )
 
     def _home_distance_m(self) -> float:
@@ -199,12 +266,13 @@ class MissionStage:
             finish=self.machine.finish,
             reason=self.machine.reason,
             elapsed_s=self.machine.elapsed_s(now),
-            time_budget_s=self.config.time_budget_s,
+            time_budget_s=self.machine.time_budget_s,
             distance_m=self._distance_m - started_m,
             return_distance_m=return_m,
             home=self._home or Pose(),
             coverage=self._coverage,
             left=left,
+            fences_version=self.fences.version,
         )
 
     def snapshot(self) -> bytes:
@@ -228,6 +296,10 @@ class MissionStage:
     def _beside_graph(self) -> dict[str, Any]:
         return {
             "machine": self.machine.snapshot(),
+            "fences": self.fences.state(),
+            "fences_told": list(self._fences_told),
+            "orders": self._orders.state(),
+            "frame": list(self._frame),
             "home": None if self._home is None else self._home.model_dump(),
             "at": None if self._at is None else self._at.model_dump(),
             "last_xy": self._last_xy,
@@ -239,6 +311,11 @@ class MissionStage:
 
     def _set_beside_graph(self, state: dict[str, Any]) -> None:
         self.machine.restore(state["machine"])
+        if "fences" in state:  # older journals have none
+            self.fences.set_state(state["fences"])
+            self._fences_told = (state["fences_told"][0], state["fences_told"][1])
+            self._orders.set_state(state["orders"])
+            self._frame = Planar(*state["frame"])
         self._home = Pose(**state["home"]) if state["home"] else None
         self._at = Pose(**state["at"]) if state["at"] else None
         self._last_xy = (state["last_xy"][0], state["last_xy"][1]) if state["last_xy"] else None

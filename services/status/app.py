@@ -9,105 +9,53 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Callable
+from typing import Literal
 
 import uvicorn
-from fastapi import FastAPI, Response
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, Gauge, generate_latest
+from fastapi import Depends, FastAPI, Response
+from prometheus_client import CONTENT_TYPE_LATEST
+from pydantic import BaseModel
 
-from schemas.base import Message
-from schemas.world import GraphRequest
+from services.status.api_mission import mission_routes
+from services.status.api_views import NO_STORE, view_routes
 from services.status.board import Board
-from services.status.config import Config
-from services.status.core import StatusCore
 from services.status.live import Painter
 from services.status.live_socket import add_live
 from services.status.page import add_page
-from services.status.picture import render_png
-from services.status.report import Readiness, StatusReport
-from services.status.view import View
+from services.status.problems import FiniteJSONResponse, install
+from services.status.report import Readiness
+from services.status.security import check_binding, require_viewer, require_viewer_socket, secure
+from services.status.shared import SharedStatus
 
-_REPORT_S = 0.5
-_NO_STORE = {"Cache-Control": "no-store"}
+__all__ = ["PortTakenError", "SharedStatus", "StatusServer", "create_app"]
 
+_SLOW_S = 0.5
+_DESCRIPTION = """What the robot does and why, and how to steer it.
 
-class SharedStatus:
-    """A `StatusCore` behind a lock: subscribers write, requests read. now_ns: the local monotonic clock."""
-
-    def __init__(self, config: Config, robot: str, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        self.config = config
-        self._core = StatusCore(config, robot)
-        self._lock = threading.Lock()
-        self._now_ns = now_ns
-
-    def observe(self, topic_name: str, message: Message) -> None:
-        """Take in one message, from any thread."""
-        with self._lock:
-            self._core.observe(topic_name, message, self._now_ns())
-
-    def graph_request(self, stamp_ns: int) -> GraphRequest | None:
-        """See `StatusCore.graph_request`."""
-        with self._lock:
-            return self._core.graph_request(self._now_ns(), stamp_ns)
-
-    def snapshot(self) -> bytes:
-        """See `StatusCore.snapshot`."""
-        with self._lock:
-            return self._core.snapshot()
-
-    def restore(self, snapshot: bytes) -> None:
-        """See `StatusCore.restore`."""
-        with self._lock:
-            self._core.restore(snapshot)
-
-    def status(self) -> StatusReport:
-        """See `StatusCore.status`."""
-        with self._lock:
-            return self._core.status(self._now_ns())
-
-    def not_ready(self) -> list[str]:
-        """See `StatusCore.not_ready`."""
-        with self._lock:
-            return self._core.not_ready(self._now_ns())
-
-    def picture_png(self) -> bytes:
-        """The map as PNG; drawn outside the lock."""
-        with self._lock:
-            picture = self._core.picture()
-        return render_png(picture, self.config.map_size_px)
-
-    def view(self, tiles_since: int, with_report: bool) -> View:
-        """See `StatusCore.view`."""
-        with self._lock:
-            return self._core.view(self._now_ns(), tiles_since, with_report)
-
-    def metrics(self) -> bytes:
-        """Prometheus text: the numbers of the mission, and of every service its rate, step time and
-        errors.
-        """
-        with self._lock:
-            numbers, report = self._core.numbers(self._now_ns()), self._core.status(self._now_ns())
-        registry = CollectorRegistry()
-        for name, value in numbers.items():
-            Gauge(f"plgrim_{name}", name.replace("_", " "), registry=registry).set(value)
-        for field in ("rate_hz", "step_p50_ms", "step_p99_ms", "memory_mb", "errors"):
-            gauge = Gauge(f"plgrim_stage_{field}", f"{field} of a service", ["service"], registry=registry)
-            for stage in report.stages:
-                gauge.labels(stage.service).set(getattr(stage, field))
-        dropped = Gauge("plgrim_dropped", "refused messages", ["service", "reason"], registry=registry)
-        for stage in report.stages:
-            for reason, count in stage.dropped.items():
-                dropped.labels(stage.service, reason).set(count)
-        return generate_latest(registry)
+Lengths are in metres, angles in radians, times in seconds of mission time, places in the frame `map` unless a field
+says otherwise. Every error is a problem (RFC 9457, `application/problem+json`) that names the field and the mend.
+"""
+_TAGS = [
+    {"name": "health", "description": "For supervisors and load balancers."},
+    {"name": "status", "description": "How it is."},
+    {
+        "name": "mission",
+        "description": "The mission, and the commands to it. These need the token of an operator.",
+    },
+    {"name": "planners", "description": "What they think."},
+    {"name": "map", "description": "What is known of the world."},
+    {"name": "events", "description": "What happened, and why."},
+    {"name": "access", "description": "Tokens."},
+]
 
 
 class LiveStatus:
-    """Draws the shared status onto a board for the live page. Report and curves at most every `_REPORT_S`."""
+    """Draws the shared status onto a board for the live page. What changes slowly at most every `_SLOW_S`."""
 
     def __init__(self, shared: SharedStatus) -> None:
         self._shared = shared
         self._painter = Painter()
-        self._reported_s = -math.inf
+        self._told_s = -math.inf
 
     @property
     def board(self) -> Board:
@@ -116,46 +64,71 @@ class LiveStatus:
 
     def tick(self) -> None:
         """Draw what has changed."""
-        now_s = time.monotonic()
-        due = now_s - self._reported_s >= _REPORT_S
-        self._reported_s = now_s if due else self._reported_s
-        self._painter.paint(self._shared.view(self._painter.pastes, due))
+        now_s, since = time.monotonic(), self._painter.pastes
+        due = now_s - self._told_s >= _SLOW_S
+        self._told_s = now_s if due else self._told_s
+        self._painter.paint(self._shared.read(lambda core, now_ns: core.view(now_ns, since, due)))
 
 
 def create_app(shared: SharedStatus) -> FastAPI:
-    """The HTTP application over a shared status."""
-    app = FastAPI(title="PLGRIM status", version="1", description="What the robot does, and why.")
+    """The HTTP application over a shared status. Raises SecurityError."""
+    app = FastAPI(
+        title="PLGRIM",
+        version="1",
+        description=_DESCRIPTION,
+        openapi_tags=_TAGS,
+        default_response_class=FiniteJSONResponse,
+    )
+    secure(app, shared.config)
+    install(app)
+    _health_routes(app, shared)
+    app.include_router(view_routes(shared))
+    app.include_router(mission_routes(shared))
+    viewer = [Depends(require_viewer)]
 
-    @app.get("/healthz")
-    def healthz() -> dict[str, str]:
+    @app.get(
+        "/map.png",
+        tags=["map"],
+        response_class=Response,
+        responses={200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}},
+        dependencies=viewer,
+    )
+    def map_png() -> Response:
+        """The map as far as it is known, with the driven path, the plan and the target."""
+        return Response(shared.picture_png(), media_type="image/png", headers=NO_STORE)
+
+    @app.get("/metrics", response_class=Response, include_in_schema=False, dependencies=viewer)
+    def metrics() -> Response:
+        """For Prometheus."""
+        return Response(shared.metrics(), media_type=CONTENT_TYPE_LATEST)
+
+    add_live(app, LiveStatus(shared), [Depends(require_viewer_socket)])
+    add_page(app)
+    return app
+
+
+class Alive(BaseModel):
+    """This process answers."""
+
+    status: Literal["ok"] = "ok"
+
+
+def _health_routes(app: FastAPI, shared: SharedStatus) -> None:
+    @app.get("/healthz", tags=["health"])
+    def healthz() -> Alive:
         """This process answers. It says nothing about the robot: see /readyz."""
-        return {"status": "ok"}
+        return Alive()
 
-    @app.get("/readyz", responses={503: {"model": Readiness}})
+    @app.get(
+        "/readyz",
+        tags=["health"],
+        responses={503: {"model": Readiness, "description": "Not ready, and why."}},
+    )
     def readyz(response: Response) -> Readiness:
         """200 when every expected service and topic is there, 503 with the reasons otherwise."""
         reasons = shared.not_ready()
         response.status_code = 503 if reasons else 200
         return Readiness(ready=not reasons, reasons=reasons)
-
-    @app.get("/api/v1/status")
-    def status() -> StatusReport:
-        """Phase, pose, coverage, target and why, plan, and how every service is."""
-        return shared.status()
-
-    @app.get("/map.png", response_class=Response, responses={200: {"content": {"image/png": {}}}})
-    def map_png() -> Response:
-        """The map as far as it is known, with the driven path, the plan and the target."""
-        return Response(shared.picture_png(), media_type="image/png", headers=_NO_STORE)
-
-    @app.get("/metrics", response_class=Response, include_in_schema=False)
-    def metrics() -> Response:
-        """For Prometheus."""
-        return Response(shared.metrics(), media_type=CONTENT_TYPE_LATEST)
-
-    add_live(app, LiveStatus(shared))
-    add_page(app)
-    return app
 
 
 class PortTakenError(RuntimeError):
@@ -166,11 +139,23 @@ class StatusServer:
     """Serves the application from a thread of its own."""
 
     def __init__(self, shared: SharedStatus) -> None:
-        """Binds the address at once: raises `PortTakenError` with what to change."""
+        """Binds the address at once: raises `PortTakenError` or `SecurityError` with what to change."""
         self.shared = shared
+        check_binding(shared.config)
         self._socket = _bind(shared.config.host, shared.config.port)
         self.port: int = self._socket.getsockname()[1]
-        settings = uvicorn.Config(create_app(shared), log_level="warning", ws="websockets-sansio", ws_per_message_deflate=False, lifespan="off")
+        settings = uvicorn.Config(
+            create_app(shared),
+            log_level="warning",
+            ws="websockets-sansio",
+            ws_per_message_deflate=False,
+            ws_max_size=4096,
+            lifespan="off",
+            server_header=False,
+            limit_concurrency=shared.config.max_connections,
+            ssl_certfile=shared.config.tls_certificate_file or None,
+            ssl_keyfile=shared.config.tls_key_file or None,
+        )
         self._server = uvicorn.Server(settings)
         self._thread = threading.Thread(target=self._serve, name="status-http", daemon=True)
 

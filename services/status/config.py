@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from schemas.topics import SERVICES
@@ -13,9 +15,35 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     host: str = Field(
-        "127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0: every interface."
+        "127.0.0.1",
+        min_length=1,
+        description="Address to listen on; 0.0.0.0: every interface. Other than loopback only with TLS.",
     )
     port: int = Field(8080, ge=0, le=65535, description="TCP port; 0: any free one.")
+    tokens_file: str = Field(
+        "",
+        description="File of tokens, a line each: `viewer NAME SECRET` or `operator NAME SECRET`. See security.py.",
+    )
+    read_token: Literal["auto", "always"] = Field(
+        "auto", description="auto: reading needs a token unless `host` is loopback; always: everywhere."
+    )
+    tls_certificate_file: str = Field("", description="PEM certificate, for HTTPS. Empty: HTTP.")
+    tls_key_file: str = Field("", description="PEM key of the certificate.")
+    trusted_network: bool = Field(
+        False,
+        description="The network of `host` has no strangers (that of one compose project): no TLS there.",
+    )
+    allowed_hosts: tuple[str, ...] = Field(
+        (),
+        description="Names, without port, under which it may be asked; on loopback its own are always among them.",
+    )
+    allowed_origins: tuple[str, ...] = Field(
+        (), description="Other sites whose pages may change things, as https://desk:8443."
+    )
+    max_body_bytes: int = Field(1_048_576, ge=1024, le=67_108_864, description="Of one request, bytes.")
+    max_connections: int = Field(
+        256, ge=8, le=10_000, description="At the same time; further ones are answered with 503."
+    )
     expected_services: tuple[str, ...] = Field(
         tuple(name for name in SERVICES if name != "status"),
         description="Services without which the robot is not ready; leave sim out on a real one.",
@@ -30,6 +58,9 @@ class Config(BaseModel):
             "reconciler/plan",
         ),
         description="Topics without which the robot is not ready; stale ones count as missing.",
+    )
+    command_timeout_s: float = Field(
+        3.0, gt=0, le=60, description="So long the mission's answer to a command is waited for, wall s."
     )
     map_size_px: int = Field(
         1000, ge=64, le=4000, description="Longer side of the picture of the map, pixels."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
@@ -11,10 +10,11 @@ from typing import TypeVar
 import numpy as np
 
 from planning.frames import Planar
-from planning.graph_mirror import FRONTIER, GraphMirror
+from planning.graph_mirror import FRONTIER, GraphMirror, RoadMap
 from planning.grid import GridSpec
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS
+from schemas.fences import Fences
 from schemas.operation import JudgeReport, MissionState, StageHealth
 from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
@@ -23,8 +23,9 @@ from schemas.topics import health_topic, topic_named
 from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest, LocalIrm, RiskMap
 from services.status.canvas import TileCanvas
 from services.status.config import Config
-from services.status.history import History
-from services.status.parts import path_xy
+from services.status.events import EventLog
+from services.status.history import Curve, CurvePoint
+from services.status.memory import LiveMemory
 from services.status.picture import Picture
 from services.status.report import (
     CoverageReport,
@@ -36,10 +37,9 @@ from services.status.report import (
     TargetReport,
     TopicReport,
 )
-from services.status.view import NO_POINTS, View
+from services.status.view import SlowView, View
 
 _RATE_SMOOTHING = 0.2
-_NEW_END_M = 0.75
 _M = TypeVar("_M", bound=Message)
 
 
@@ -63,10 +63,9 @@ class StatusCore:
         self.robot = robot
         self.canvas = TileCanvas()
         self.target_switches = 0
-        self.history = History()
-        self._old_path = NO_POINTS
-        self._pids: dict[str, int] = {}
-        self._restarts: Counter[str] = Counter()
+        self.events = EventLog()
+        self.curve = Curve()
+        self.memory = LiveMemory()
         self._seen: dict[str, _Seen] = {}
         self._trajectory: list[tuple[float, float]] = []
         self._mirror = GraphMirror()
@@ -75,11 +74,9 @@ class StatusCore:
 
     def observe(self, topic_name: str, message: Message, now_ns: int) -> None:
         """Take in one message. now_ns: local monotonic clock, the same one that the other calls are given."""
-        if isinstance(message, Plan):
-            self._keep_old_path(message)
-        elif isinstance(message, StageHealth):
-            self._count_restarts(message)
         self._note(topic_name, message, now_ns)
+        self.events.observe(message)
+        self.memory.observe(message)
         if isinstance(message, Odometry):
             self._follow(message)
         elif isinstance(message, CoverageWindow):
@@ -90,32 +87,22 @@ class StatusCore:
             self.target_switches += message.switched
         elif isinstance(message, GlobalIrm):
             self._graph_fits = self._mirror.apply(message)
-        elif isinstance(message, MissionState) and self.history.due(message.elapsed_s):
-            self._sample(message)
+        elif isinstance(message, CoverageSummary):
+            self._note_coverage(message)
 
-    def _keep_old_path(self, plan: Plan) -> None:
-        """The path that a new policy replaces: the end of the new one does not lie on it."""
-        last = self._latest("reconciler/plan", Plan)
-        if last is None or not last.valid or not plan.valid:
-            return
-        gaps = np.hypot(last.x_m - plan.x_m[-1], last.y_m - plan.y_m[-1])
-        if float(gaps.min()) > _NEW_END_M:
-            self._old_path = path_xy(last)
-
-    def _count_restarts(self, health: StageHealth) -> None:
-        if self._pids.get(health.service, health.pid) != health.pid:
-            self._restarts[health.service] += 1
-        self._pids[health.service] = health.pid
-
-    def _sample(self, state: MissionState) -> None:
-        judge = self._latest("sim/judge", JudgeReport)
-        steps = {
-            seen.message.service: seen.message.step_p50_ms
-            for seen in self._seen.values()
-            if isinstance(seen.message, StageHealth)
-        }
-        found = None if judge is None else judge.coverage
-        self.history.add(state.elapsed_s, state.coverage, found, state.distance_m, steps)
+    def _note_coverage(self, summary: CoverageSummary) -> None:
+        state, judge = self._latest("mission/state", MissionState), self._latest("sim/judge", JudgeReport)
+        if state is not None:
+            seen = math.nan if judge is None else judge.coverage
+            self.curve.add(
+                CurvePoint(
+                    state.elapsed_s,
+                    summary.covered_fraction,
+                    summary.covered_area_m2,
+                    state.distance_m,
+                    seen,
+                )
+            )
 
     def _note(self, topic_name: str, message: Message, now_ns: int) -> None:
         seen = self._seen.get(topic_name)
@@ -183,6 +170,15 @@ class StatusCore:
             topics=self._topics(now_ns),
         )
 
+    @property
+    def graph(self) -> tuple[int, RoadMap]:
+        """Version and content of the Global IRM as far as it is known here; version 0: nothing yet."""
+        return self._mirror.version, self._mirror.road_map()
+
+    def latest(self, topic_name: str, kind: type[_M]) -> _M | None:
+        """The newest message of a topic, or None when none has come."""
+        return self._latest(topic_name, kind)
+
     def _latest(self, topic_name: str, kind: type[_M]) -> _M | None:
         seen = self._seen.get(topic_name)
         return seen.message if seen is not None and isinstance(seen.message, kind) else None
@@ -207,6 +203,7 @@ class StatusCore:
             distance_m=state.distance_m,
             return_distance_m=state.return_distance_m,
             left=len(state.left),
+            fences_version=state.fences_version,
         )
 
     def _coverage(self, judge: JudgeReport | None) -> CoverageReport | None:
@@ -297,26 +294,37 @@ class StatusCore:
     def view(self, now_ns: int, tiles_since: int, with_report: bool) -> View:
         """What the live page shows, to be drawn outside the lock: nothing in it changes any more.
 
-        tiles_since: tiles of the canvas that changed after this number are copied. with_report: make the report too.
+        tiles_since: tiles of the canvas that changed after this number are copied. with_report: tell what is told
+        more slowly, too.
         """
         place, (pastes, tiles) = self._pose(), self.canvas.changed(tiles_since)
         return View(
-            odometry=self._latest("sim/odometry", Odometry),
+            odometry=self.latest("sim/odometry", Odometry),
             place=None if place is None else (place.x_m, place.y_m, place.yaw_rad),
-            risk=self._latest("riskmap/risk_map", RiskMap),
-            local=self._latest("irm/local_irm", LocalIrm),
-            policy=self._latest("gcp/global_policy", GlobalPolicy),
-            plan=self._latest("reconciler/plan", Plan),
-            old_path=self._old_path,
+            risk=self.latest("riskmap/risk_map", RiskMap),
+            local=self.latest("irm/local_irm", LocalIrm),
+            policy=self.latest("gcp/global_policy", GlobalPolicy),
+            plan=self.latest("reconciler/plan", Plan),
+            fences=self.latest("mission/fences", Fences),
+            old_path=self.memory.old_path,
             graph=self._mirror.road_map(),
             pastes=pastes,
             tiles=tiles,
             tile_names=self.canvas.tiles(),
             resolution_m=self.canvas.resolution_m,
             trajectory=self._trajectory.copy(),
-            history=self.history.rows() if with_report else None,
-            report=self.status(now_ns) if with_report else None,
-            restarts=dict(self._restarts),
+            slow=self._slow(now_ns) if with_report else None,
+        )
+
+    def _slow(self, now_ns: int) -> SlowView:
+        state = self.latest("mission/state", MissionState)
+        return SlowView(
+            report=self.status(now_ns),
+            began_s=None if state is None else state.stamp_ns / SECOND_NS - state.elapsed_s,
+            restarts=dict(self.memory.restarts),
+            curve=tuple(self.curve.points),
+            step_times=self.memory.step_times.rows(),
+            events=tuple(self.events.events),
         )
 
     def _plan_in_map(self) -> tuple[tuple[float, float], ...]:
@@ -339,7 +347,10 @@ class StatusCore:
                 "canvas": self.canvas.state(),
                 "trajectory": trajectory,
                 "target_switches": self.target_switches,
-                "history": self.history.state(),
+                "events": self.events.state(),
+                "curve": [list(point) for point in self.curve.points],
+                "curve_spacing_s": self.curve.spacing_s,
+                "memory": self.memory.state(),
             }
         )
 
@@ -349,8 +360,12 @@ class StatusCore:
         self.canvas.set_state(state["canvas"])
         self._trajectory = [(float(x), float(y)) for x, y in state["trajectory"]]
         self.target_switches = int(state["target_switches"])
-        if "history" in state:
-            self.history.set_state(state["history"])
+        if "events" in state:  # older snapshots have none
+            self.events.set_state(state["events"])
+            self.curve.points = [CurvePoint(*point) for point in state["curve"]]
+            self.curve.spacing_s = state["curve_spacing_s"]
+        if "memory" in state:
+            self.memory.set_state(state["memory"])
 
     def numbers(self, now_ns: int) -> Mapping[str, float]:
         """The numbers of the status by name, for metrics; only what is known."""
@@ -358,6 +373,7 @@ class StatusCore:
         found: dict[str, float | None] = {
             "ready": float(report.ready),
             "target_switches": float(report.target_switches),
+            "events_total": float(self.events.last_id),
         }
         if report.coverage is not None:
             found |= {

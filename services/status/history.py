@@ -1,61 +1,74 @@
-"""Curves over the mission: coverage and step times, sampled as the mission goes on."""
+"""Coverage over time, kept in a bounded number of points."""
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
-from schemas.topics import SERVICES
-
-COLUMNS = ("elapsed_s", "coverage", "judge", "distance_m", *SERVICES)
-"""Coverage by the belief and by the judge (NaN: none), distance, and the median step time of each service, ms."""
-CHUNK = 256
-"""Samples in one part of the live page."""
+from pydantic import BaseModel, ConfigDict, Field
 
 
-class History:
-    """Samples at least `every_s` of mission time apart; beyond `limit` every second one is dropped."""
+class CurvePoint(NamedTuple):
+    """elapsed_s: of the mission. belief: share of the ground known. judge: the simulator's, nan on a real robot."""
 
-    def __init__(self, every_s: float = 2.0, limit: int = 4096) -> None:
-        self.every_s = every_s
-        self.limit = limit
-        self._rows: list[tuple[float, ...]] = []
+    elapsed_s: float
+    belief: float
+    covered_area_m2: float
+    distance_m: float
+    judge: float
 
-    def due(self, elapsed_s: float) -> bool:
-        """Whether a sample is wanted now. A mission that began anew begins a new history."""
-        if self._rows and elapsed_s < self._rows[-1][0]:
-            self._rows.clear()
-        return not self._rows or elapsed_s - self._rows[-1][0] >= self.every_s
 
-    def add(
-        self,
-        elapsed_s: float,
-        coverage: float,
-        judge: float | None,
-        distance_m: float,
-        step_ms: dict[str, float],
-    ) -> None:
-        """Take one sample. step_ms: median step time by service."""
-        steps = (step_ms.get(name, math.nan) for name in SERVICES)
-        self._rows.append((elapsed_s, coverage, math.nan if judge is None else judge, distance_m, *steps))
-        if len(self._rows) > self.limit:
-            self._rows = self._rows[::2]
-            self.every_s *= 2
+@dataclass(slots=True)
+class Curve:
+    """Points in time, thinned out by half when there are too many: the spacing doubles."""
 
-    def rows(self) -> NDArray[np.float32]:
-        """(n, columns) as in `COLUMNS`."""
-        return np.array(self._rows, np.float32).reshape(-1, len(COLUMNS))
+    most: int = 4000
+    spacing_s: float = 1.0
+    points: list[CurvePoint] = field(default_factory=list)
 
-    def state(self) -> dict[str, Any]:
-        """For a snapshot."""
-        rows = np.array(self._rows, np.float64).reshape(-1, len(COLUMNS))
-        return {"every_s": self.every_s, "columns": list(COLUMNS), "rows": rows}
+    def add(self, point: CurvePoint) -> None:
+        """Note a point, unless the last one is nearer than the spacing. Time that went back begins anew."""
+        if self.points and point.elapsed_s < self.points[-1].elapsed_s:
+            self.points.clear()
+        if self.points and point.elapsed_s - self.points[-1].elapsed_s < self.spacing_s:
+            return
+        self.points.append(point)
+        if len(self.points) > self.most:
+            self.points = self.points[::2]
+            self.spacing_s *= 2.0
 
-    def set_state(self, state: dict[str, Any]) -> None:
-        """From a snapshot; one of other columns is not taken."""
-        if tuple(state["columns"]) == COLUMNS:
-            self.every_s = float(state["every_s"])
-            self._rows = [tuple(float(value) for value in row) for row in state["rows"]]
+
+class CoveragePoint(BaseModel):
+    """One point of the curve."""
+
+    elapsed_s: float
+    belief: float = Field(
+        description="Share of the ground known to be reachable that is covered, by the belief."
+    )
+    covered_area_m2: float
+    distance_m: float
+    judge: float | None = Field(description="The simulator's own; null on a real robot.")
+
+
+class CoverageCurve(BaseModel):
+    """Coverage over time, oldest first."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "examples": [
+                {
+                    "points": [
+                        {
+                            "elapsed_s": 60.0,
+                            "belief": 0.41,
+                            "covered_area_m2": 97.3,
+                            "distance_m": 31.8,
+                            "judge": 0.28,
+                        }
+                    ]
+                }
+            ]
+        }
+    )
+
+    points: list[CoveragePoint]

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.status.board import Board
-from services.status.history import CHUNK, COLUMNS
+from services.status.events import Event
 from services.status.parts import (
+    fences_part,
     graph_parts,
     local_part,
     plan_part,
@@ -17,9 +18,14 @@ from services.status.parts import (
     risk_part,
     tile_part,
 )
-from services.status.view import View
+from services.status.step_times import COLUMNS
+from services.status.view import SlowView, View
 
 _TRAIL_CHUNK = 256
+_ROWS = 256
+_EVENTS = 320
+_EVENT_CHUNK = 32
+_CURVE = ("elapsed_s", "belief", "judge")
 
 
 class Painter:
@@ -32,7 +38,8 @@ class Painter:
 
     def _new(self, key: str, source: object) -> bool:
         """Whether this source has not been drawn yet; remembers it."""
-        if source is None or self._drawn.get(key) is source:
+        held = self._drawn.get(key)
+        if source is None or held is source or (isinstance(source, tuple) and held == source):
             return False
         self._drawn[key] = source
         return True
@@ -51,10 +58,37 @@ class Painter:
         self._paint_graph(view)
         self._paint_tiles(view)
         self._paint_trail(view)
-        if view.report is not None:
-            board.put("status", view.report.model_dump(mode="json") | {"restarts": view.restarts})
-        if view.history is not None:
-            self._paint_history(view.history)
+        if view.fences is not None and self._new("fences", view.fences):
+            board.put("fences", fences_part(view.fences))
+        if view.slow is not None:
+            self._paint_slow(view.slow)
+
+    def _paint_slow(self, slow: SlowView) -> None:
+        more = {"restarts": slow.restarts, "began_s": slow.began_s}
+        self.board.put("status", slow.report.model_dump(mode="json") | more)
+        curve = [(point.elapsed_s, point.belief, point.judge) for point in slow.curve]
+        self._paint_rows("curve", _CURVE, np.array(curve, np.float32).reshape(-1, len(_CURVE)))
+        self._paint_rows("steps", COLUMNS, slow.step_times)
+        self._paint_events(slow.events)
+
+    def _paint_rows(self, word: str, columns: tuple[str, ...], rows: NDArray[np.float32]) -> None:
+        chunks = -(-len(rows) // _ROWS)
+        for chunk in range(chunks):
+            part = rows[chunk * _ROWS : (chunk + 1) * _ROWS]
+            self.board.put(f"{word}:{chunk}", {"columns": list(columns), "rows": raw(part, "f4")})
+        self.board.keep_only(f"{word}:", {f"{word}:{n}" for n in range(chunks)})
+
+    def _paint_events(self, events: tuple[Event, ...]) -> None:
+        """The newest ones, in chunks by their number."""
+        shown = events[-_EVENTS:]
+        if not self._new("events", (shown[0].id, shown[-1].id) if shown else None):
+            return
+        chunks: dict[int, list[dict[str, object]]] = {}
+        for event in shown:
+            chunks.setdefault(event.id // _EVENT_CHUNK, []).append(event.model_dump(mode="json"))
+        for number, told in chunks.items():
+            self.board.put(f"events:{number}", {"events": told})
+        self.board.keep_only("events:", {f"events:{number}" for number in chunks})
 
     def _paint_graph(self, view: View) -> None:
         if self._new("graph", view.graph):
@@ -84,10 +118,3 @@ class Painter:
             points = view.trajectory[chunk * _TRAIL_CHUNK : (chunk + 1) * _TRAIL_CHUNK + 1]
             self.board.put(f"trail:{chunk}", {"xy": raw(np.array(points), "f4")})
         self.board.keep_only("trail:", {f"trail:{n}" for n in range(-(-count // _TRAIL_CHUNK))})
-
-    def _paint_history(self, rows: NDArray[np.float32]) -> None:
-        chunks = -(-len(rows) // CHUNK)
-        for chunk in range(chunks):
-            part = rows[chunk * CHUNK : (chunk + 1) * CHUNK]
-            self.board.put(f"hist:{chunk}", {"columns": list(COLUMNS), "rows": raw(part, "f4")})
-        self.board.keep_only("hist:", {f"hist:{n}" for n in range(chunks)})

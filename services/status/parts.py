@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.graph_mirror import FRONTIER, RoadMap
+from schemas.fences import Fences
 from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
 from schemas.world import LocalIrm, RiskMap
@@ -169,3 +170,19 @@ def plan_part(plan: Plan, old: NDArray[np.float64]) -> Part:
         "xy": raw(path_xy(plan), "f4"),
         "old": raw(old, "f4"),
     }
+
+
+def fences_part(fences: Fences) -> Part:
+    """The polygons: their rings as points in the frame that each names."""
+    told = [
+        {
+            "id": fence.fence_id,
+            "kind": fence.kind.value,
+            "name": fence.name,
+            "frame": fence.frame.value,
+            "weight": fence.weight,
+            "rings": [ring.points for ring in fence.rings],
+        }
+        for fence in fences.fences
+    ]
+    return {"version": fences.version, "fences": told}

@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from planning.grid import GridSpec
 
-_COLOURS = np.array(
+COLOURS = np.array(
     [
         (236, 236, 236),  # unknown
         (255, 214, 102),  # reachable, not covered
@@ -59,7 +59,7 @@ def render_png(picture: Picture, size_px: int) -> bytes:
 
 
 def _placeholder(title: str) -> Image.Image:
-    image = Image.new("RGB", (480, 240), tuple(_COLOURS[0].tolist()))
+    image = Image.new("RGB", (480, 240), tuple(COLOURS[0].tolist()))
     draw = ImageDraw.Draw(image)
     font = ImageFont.load_default()
     draw.text((16, 100), "no map yet", fill=(90, 90, 90), font=font)
@@ -72,9 +72,9 @@ def _draw(picture: Picture, spec: GridSpec, cells: NDArray[np.uint8], size_px: i
     if scale > 1:
         scale = float(math.floor(scale))  # whole pixels a cell: sharp edges
     width, height = max(1, round(spec.width * scale)), max(1, round(spec.height * scale))
-    cells_image = Image.fromarray(_COLOURS[np.minimum(cells[::-1], len(_COLOURS) - 1)])
+    cells_image = Image.fromarray(COLOURS[np.minimum(cells[::-1], len(COLOURS) - 1)])
     frame = (width + 2 * _MARGIN_PX, height + 2 * _MARGIN_PX + _TITLE_PX)
-    image = Image.new("RGB", frame, tuple(_COLOURS[0].tolist()))
+    image = Image.new("RGB", frame, tuple(COLOURS[0].tolist()))
     image.paste(
         cells_image.resize((width, height), Image.Resampling.NEAREST), (_MARGIN_PX, _MARGIN_PX + _TITLE_PX)
     )

@@ -62,6 +62,71 @@ class MissionReport(_Part):
     distance_m: float
     return_distance_m: float
     left: int
+    fences_version: int = 0
+
+
+class LeftReport(_Part):
+    """Ground that is not covered, and why; in `map`."""
+
+    x_m: float
+    y_m: float
+    gain: float
+    reason: str
+
+
+class MissionDetail(MissionReport):
+    """The mission with the places that are left, best first."""
+
+    home: PlaceReport
+    places_left: list[LeftReport]
+
+
+class AlternativeReport(_Part):
+    """A frontier that the global planner weighed. gain: nats of whole patches; cells: the same in whole patches."""
+
+    frontier: int
+    x_m: float
+    y_m: float
+    gain: float
+    cells: float
+    distance_m: float
+    risk: float
+    q: float
+    words: str = Field(examples=["frontier 41: 38 cells expected, 12 m, low risk"])
+
+
+class PolicyNode(_Part):
+    """Of the QMDP policy: the node that it goes to next from a node (-1: stay), and its value."""
+
+    node: int
+    x_m: float
+    y_m: float
+    next: int
+    value: float
+
+
+class LocalSearch(_Part):
+    """The local planner's last answer. phase: guide, cover or none."""
+
+    episode: int
+    phase: str
+    reason: str
+    simulations: int
+    tree_nodes: int
+    root_value: float
+    rollout_value: float
+    planning_ms: float
+
+
+class PlannerReport(_Part):
+    """What the planners think. tau_s: how much of the old policy was kept."""
+
+    target: TargetReport | None
+    alternatives: list[AlternativeReport]
+    policy: list[PolicyNode]
+    route: list[tuple[float, float]]
+    tau_s: float | None
+    local: LocalSearch | None
 
 
 class StageReport(_Part):

@@ -8,12 +8,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.graph_mirror import RoadMap
+from schemas.fences import Fences
 from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
 from schemas.world import LocalIrm, RiskMap
+from services.status.events import Event
+from services.status.history import CurvePoint
 from services.status.report import StatusReport
 
 NO_POINTS: NDArray[np.float64] = np.empty((0, 2))
+
+
+class SlowView(NamedTuple):
+    """What is told twice a second. began_s: mission clock at the start. step_times: rows as in `StepTimes`."""
+
+    report: StatusReport
+    began_s: float | None
+    restarts: dict[str, int]
+    curve: tuple[CurvePoint, ...]
+    step_times: NDArray[np.float32]
+    events: tuple[Event, ...]
 
 
 class View(NamedTuple):
@@ -21,7 +35,6 @@ class View(NamedTuple):
 
     place: x, y, yaw in `map`. old_path: (m, 2) in `odom`. pastes: to ask for the canvas' next changes with.
     tiles: changed tiles of the canvas. trajectory: driven way in `map`.
-    history: rows as in `History`, with the report. restarts: of each service as seen from here.
     """
 
     odometry: Odometry | None
@@ -30,6 +43,7 @@ class View(NamedTuple):
     local: LocalIrm | None
     policy: GlobalPolicy | None
     plan: Plan | None
+    fences: Fences | None
     old_path: NDArray[np.float64]
     graph: RoadMap
     pastes: int
@@ -37,6 +51,4 @@ class View(NamedTuple):
     tile_names: set[tuple[int, int]]
     resolution_m: float
     trajectory: list[tuple[float, float]]
-    history: NDArray[np.float32] | None
-    report: StatusReport | None
-    restarts: dict[str, int]
+    slow: SlowView | None

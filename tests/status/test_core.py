@@ -220,7 +220,7 @@ def test_asks_for_the_graph_when_a_difference_was_missed() -> None:
 
 def test_numbers_have_only_what_is_known() -> None:
     status = core()
-    assert dict(status.numbers(0)) == {"ready": 0.0, "target_switches": 0.0}
+    assert dict(status.numbers(0)) == {"ready": 0.0, "target_switches": 0.0, "events_total": 0.0}
     fill(status, 0)
     assert status.numbers(0)["coverage_belief"] == pytest.approx(0.75)
 

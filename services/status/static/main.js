@@ -146,7 +146,7 @@ function useTools(setAnswer) {
     setAnswer(await api.change("POST", ...fenceRequest(kind, points)));
   };
   const cancel = () => set(null);
-  const remove = async (fence) => setAnswer(await api.change("DELETE", `api/v1/fences/${encodeURIComponent(fence.id)}`));
+  const remove = async (fence) => setAnswer(await api.change("DELETE", `api/v1/mission/fences/${encodeURIComponent(fence.id)}`));
   useEffect(() => {
     if (app.map) Object.assign(app.map, { onFinish: finish, onCancel: cancel });
   });
@@ -156,8 +156,8 @@ function useTools(setAnswer) {
 // A polygon in `map` as GeoJSON, its ring closed.
 function fenceRequest(kind, points) {
   const ring = [...points, points[0]].map(([x, y]) => [Number(x.toFixed(3)), Number(y.toFixed(3))]);
-  const geometry = { type: "Polygon", coordinates: [ring] };
-  return ["api/v1/fences", { type: "Feature", geometry, properties: { kind, frame: "map" } }];
+  const geojson = { type: "Polygon", coordinates: [ring] };
+  return ["api/v1/mission/fences", { kind, frame: "map", geojson }];
 }
 
 function Page() {
@@ -174,7 +174,7 @@ function Page() {
     setAnswer({ says: `${kind}: sent…` });
     setAnswer(await api.change("POST", `api/v1/mission/${kind}`));
   };
-  const setBudget = async (seconds) => setAnswer(await api.change("PUT", "api/v1/mission/budget", { time_budget_s: seconds }));
+  const setBudget = async (seconds) => setAnswer(await api.change("PUT", "api/v1/mission/time-budget", { time_budget_s: seconds }));
   const title = link.lost && link.everHeard ? "✕ link lost" : status?.mission?.phase ?? "…";
   useEffect(() => void (document.title = `${title} · PLGRIM ${status?.robot ?? ""}`));
   return html`
@@ -189,10 +189,10 @@ function Page() {
         <section aria-labelledby="h-fences"><h2 id="h-fences">Polygons</h2>
           <${Fences} fences=${fences()} lost=${link.lost} ...${tools} /></section>
         <section aria-labelledby="h-events"><h2 id="h-events">Events</h2>
-          <${Events} events=${store.get("events")?.events ?? []} /></section>
+          <${Events} events=${store.events()} beganS=${status?.began_s ?? 0} /></section>
         <section aria-labelledby="h-services"><h2 id="h-services">Services</h2>
           <${Services} status=${status} sinceS=${sinceS} /></section>
-        <section aria-labelledby="h-curves"><h2 id="h-curves">Curves</h2><${Plots} history=${store.history()} /></section>
+        <section aria-labelledby="h-curves"><h2 id="h-curves">Curves</h2><${Plots} curve=${store.rows("curve")} steps=${store.rows("steps")} /></section>
       </div>
     </main>
     <${TokenDialog} ask=${ask?.why} answer=${(token) => (ask?.resolve(token), setAsk(null))} />`;

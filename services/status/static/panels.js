@@ -102,14 +102,15 @@ export function Services({ status, sinceS }) {
 
 const SHOWN = 200;
 
-export function Events({ events }) {
+export function Events({ events, beganS }) {
   const [all, setAll] = useState(true);
-  const shown = events.filter((event) => all || event.bad).slice(-SHOWN).reverse();
+  const shown = events.filter((event) => all || event.severity !== "info").slice(-SHOWN).reverse();
   return html`
-    <label class="check"><input type="checkbox" checked=${!all} onChange=${() => setAll(!all)} /> only faults</label>
+    <label class="check"><input type="checkbox" checked=${!all} onChange=${() => setAll(!all)} /> only warnings and errors</label>
     <ol class="events" tabindex="0" role="log" aria-label="Events, newest first">
-      ${shown.map((event) => html`<li key=${event.id} class=${event.bad ? "bad" : ""}>
-        <time>${duration(event.at_s)}</time> <span>${event.text}</span></li>`)}
+      ${shown.map((event) => html`<li key=${event.id} data-severity=${event.severity}>
+        <time>${duration(event.mission_time_s - beganS)}</time>
+        <span>${event.severity === "info" ? "" : html`<strong>${event.severity}: </strong>`}${event.text}</span></li>`)}
     </ol>
     ${shown.length ? null : html`<p class="soft">Nothing has happened yet.</p>`}`;
 }

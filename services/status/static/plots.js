@@ -1,6 +1,6 @@
 // Curves over the mission, by uPlot.
 
-import { html, useEffect, useRef } from "./vendor/htm-preact.module.js";
+import { html, useEffect, useMemo, useRef } from "./vendor/htm-preact.module.js";
 import { duration } from "./words.js";
 
 const SERIES_MAX = 1500; // points that are drawn of a long curve
@@ -54,20 +54,23 @@ export const STEP_SERIES = [
   ["reconciler", "--plot-5", [8, 4]], ["mission", "--plot-6", [2, 3]],
 ].map(([name, colour, dash]) => ({ name, colour, dash }));
 
-export function Plots({ history }) {
-  if (!history || history.elapsed_s.length < 2)
-    return html`<p class="soft">The curves begin with the mission.</p>`;
+const SHARE = [0, 100];
+
+function coverageColumns(curve, judged) {
   const share = (column) => column.map((value) => (value === null ? null : 100 * value));
-  const judged = history.judge.some((value) => value !== null);
-  const coverage = [{ name: "belief", colour: "--plot-1" }];
-  const columns = [history.elapsed_s, share(history.coverage)];
-  if (judged) {
-    coverage.push({ name: "true (simulator)", colour: "--plot-5", dash: [8, 4] });
-    columns.push(share(history.judge));
-  }
-  const steps = [history.elapsed_s, ...STEP_SERIES.map(({ name }) => history[name])];
+  const columns = [curve.elapsed_s, share(curve.belief)];
+  return judged ? [...columns, share(curve.judge)] : columns;
+}
+
+export function Plots({ curve, steps }) {
+  const judged = curve?.judge.some((value) => value !== null) ?? false;
+  const coverage = useMemo(() => curve && coverageColumns(curve, judged), [curve]);
+  const times = useMemo(() => steps && [steps.elapsed_s, ...STEP_SERIES.map(({ name }) => steps[name])], [steps]);
+  if (!curve || !steps || curve.elapsed_s.length < 2) return html`<p class="soft">The curves begin with the mission.</p>`;
+  const series = [{ name: "belief", colour: "--plot-1" }];
+  if (judged) series.push({ name: "true (simulator)", colour: "--plot-5", dash: [8, 4] });
   return html`
-    <${Plot} label="Coverage over time" columns=${columns} series=${coverage} unit=" %" range=${[0, 100]} key=${judged} />
-    <${Plot} label="Median step time" columns=${steps} series=${STEP_SERIES} unit=" ms"
+    <${Plot} label="Coverage over time" columns=${coverage} series=${series} unit=" %" range=${SHARE} key=${judged} />
+    <${Plot} label="Median step time" columns=${times} series=${STEP_SERIES} unit=" ms"
       range=${(_, low, high) => [0, Math.max(high ?? 1, 1)]} />`;
 }

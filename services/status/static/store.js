@@ -67,8 +67,13 @@ export class Store {
     return this.memo("graph", ["graph"], () => joinGraph(this.all("graph")));
   }
 
-  history() {
-    return this.memo("history", ["hist"], () => joinHistory(this.all("hist")));
+  // Columns of numbers by name, or null while there are none.
+  rows(word) {
+    return this.memo(word, [word], () => joinRows(this.all(word)));
+  }
+
+  events() {
+    return this.memo("events", ["events"], () => this.all("events").flatMap((part) => part.events));
   }
 
   trail() {
@@ -116,7 +121,7 @@ function joinEdges(chunks, place, last) {
   return edges;
 }
 
-function joinHistory(chunks) {
+function joinRows(chunks) {
   if (!chunks.length) return null;
   const names = chunks[0].columns;
   const columns = Object.fromEntries(names.map((name) => [name, []]));
