@@ -56,6 +56,7 @@ class LiveStatus:
         self._shared = shared
         self._painter = Painter()
         self._told_s = -math.inf
+        self.tick()  # its kernel is compiled before anybody looks
 
     @property
     def board(self) -> Board:

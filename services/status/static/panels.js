@@ -2,7 +2,7 @@
 
 import { html, useEffect, useRef, useState } from "./vendor/htm-preact.module.js";
 import { FENCE_KINDS } from "./layers.js";
-import { PHASES, STATES, age, duration, metres, percent, targetWords } from "./words.js";
+import { PHASES, STATES, age, clock, duration, metres, percent, targetWords } from "./words.js";
 
 export function Mission({ status, policy, plan }) {
   const mission = status?.mission, coverage = status?.coverage;
@@ -85,18 +85,18 @@ export function Services({ status, sinceS }) {
   const stages = status?.stages ?? [];
   return html`<div class="scroll" tabindex="0" role="region" aria-label="Services, table"><table class="services">
     <thead><tr><th scope="col">Service</th><th scope="col">State</th><th scope="col" class="number">Rate</th>
-      <th scope="col" class="number">Step</th><th scope="col" class="number">Age</th><th scope="col" class="number">Restarts</th>
-      <th scope="col">Last error</th></tr></thead>
+      <th scope="col" class="number wide">Step</th><th scope="col" class="number">Age</th><th scope="col" class="number">Restarts</th></tr></thead>
     <tbody>${stages.map((stage) => {
       const [sign, words] = STATES[stage.state] ?? ["?", stage.state];
       const late = stage.age_s === null ? null : stage.age_s + sinceS;
       const waiting = stage.waiting_for.length ? `waits for ${stage.waiting_for.join(", ")}` : "";
       return html`<tr key=${stage.service} data-state=${stage.state}>
         <th scope="row">${stage.service}</th><td><span class="sign" aria-hidden="true">${sign}</span> ${words}</td>
-        <td class="number">${stage.rate_hz.toFixed(1)} Hz</td><td class="number">${stage.step_p50_ms.toFixed(1)} ms</td>
+        <td class="number">${stage.rate_hz.toFixed(1)} Hz</td><td class="number wide">${stage.step_p50_ms.toFixed(1)} ms</td>
         <td class="number">${age(late)}</td>
-        <td class="number">${status.restarts?.[stage.service] ?? 0}</td>
-        <td class="error">${stage.last_error || waiting || "–"}</td></tr>`;
+        <td class="number">${status.restarts?.[stage.service] ?? 0}</td></tr>
+        ${stage.last_error || waiting ? html`<tr class="more" key=${`${stage.service}-more`}><td colspan="6">${
+          stage.last_error ? `last error: ${stage.last_error}` : ""} ${waiting}</td></tr>` : null}`;
     })}</tbody></table></div>`;
 }
 
@@ -109,7 +109,7 @@ export function Events({ events, beganS }) {
     <label class="check"><input type="checkbox" checked=${!all} onChange=${() => setAll(!all)} /> only warnings and errors</label>
     <ol class="events" tabindex="0" role="log" aria-label="Events, newest first">
       ${shown.map((event) => html`<li key=${event.id} data-severity=${event.severity}>
-        <time>${duration(event.mission_time_s - beganS)}</time>
+        <time>${clock(event.mission_time_s - beganS)}</time>
         <span>${event.severity === "info" ? "" : html`<strong>${event.severity}: </strong>`}${event.text}</span></li>`)}
     </ol>
     ${shown.length ? null : html`<p class="soft">Nothing has happened yet.</p>`}`;

@@ -1,7 +1,7 @@
 // Curves over the mission, by uPlot.
 
 import { html, useEffect, useMemo, useRef } from "./vendor/htm-preact.module.js";
-import { duration } from "./words.js";
+import { clock } from "./words.js";
 
 const SERIES_MAX = 1500; // points that are drawn of a long curve
 
@@ -26,10 +26,10 @@ export function Plot({ label, columns, series, unit, range }) {
       legend: { live: true },
       scales: { x: { time: false }, y: { range } },
       axes: [
-        { ...axis, size: 28, space: 70, values: (_, marks) => marks.map(duration) },
+        { ...axis, size: 28, space: 70, values: (_, marks) => marks.map(clock) },
         { ...axis, size: 46, values: (_, marks) => marks.map((mark) => `${+mark.toFixed(3)}${unit}`) },
       ],
-      series: [{ label: "at", value: (_, v) => (v === null ? "–" : duration(v)) },
+      series: [{ label: "at", value: (_, v) => (v === null ? "–" : clock(v)) },
         ...series.map(({ name, colour, dash }) => ({ label: name, stroke: css(colour), width: 2, dash,
           points: { show: false }, spanGaps: true,
           value: (_, v) => (v === null || v === undefined ? "–" : `${v.toFixed(1)}${unit}`) }))],
@@ -72,5 +72,5 @@ export function Plots({ curve, steps }) {
   return html`
     <${Plot} label="Coverage over time" columns=${coverage} series=${series} unit=" %" range=${SHARE} key=${judged} />
     <${Plot} label="Median step time" columns=${times} series=${STEP_SERIES} unit=" ms"
-      range=${(_, low, high) => [0, Math.max(high ?? 1, 1)]} />`;
+      range=${(_, low, high) => [0, 1.1 * Math.max(high ?? 1, 1)]} />`;
 }

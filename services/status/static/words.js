@@ -27,9 +27,16 @@ export const PHASES = { idle: "Waiting for the start", explore: "Exploring", pau
 export const STATES = { ok: ["●", "working"], not_ready: ["◐", "not ready"], silent: ["▲", "silent"],
   missing: ["✕", "not heard of"] };
 
+// As on a clock, short: 1:05, 1:02:05.
+export function clock(seconds) {
+  const s = Math.max(0, Math.round(seconds)), two = (n) => String(n).padStart(2, "0");
+  const minutes = `${s < 3600 ? Math.floor(s / 60) : two(Math.floor((s % 3600) / 60))}:${two(s % 60)}`;
+  return s < 3600 ? minutes : `${Math.floor(s / 3600)}:${minutes}`;
+}
+
 // Why this target: "frontier 41: 38 cells expected, 12 m, low risk".
 export function targetWords(policy) {
   if (!policy || policy.target < 0) return "no target";
-  const risk = policy.risk < 0.05 ? "low risk" : policy.risk < 0.25 ? "some risk" : "high risk";
-  return `frontier ${policy.target}: ${policy.gain.toFixed(0)} cells expected, ${metres(policy.distance_m)}, ${risk}`;
+  const risk = policy.risk < 0.1 ? "low risk" : policy.risk < 0.3 ? "medium risk" : "high risk";
+  return `frontier ${policy.target}: ${(policy.gain / Math.LN2).toFixed(0)} cells expected, ${metres(policy.distance_m)}, ${risk}`;
 }
