@@ -38,8 +38,7 @@ class Painter:
 
     def _new(self, key: str, source: object) -> bool:
         """Whether this source has not been drawn yet; remembers it."""
-        held = self._drawn.get(key)
-        if source is None or held is source or (isinstance(source, tuple) and held == source):
+        if source is None or self._drawn.get(key) is source:
             return False
         self._drawn[key] = source
         return True
@@ -81,7 +80,7 @@ class Painter:
     def _paint_events(self, events: tuple[Event, ...]) -> None:
         """The newest ones, in chunks by their number."""
         shown = events[-_EVENTS:]
-        if not self._new("events", (shown[0].id, shown[-1].id) if shown else None):
+        if not shown or not self._new("events", shown[-1]):
             return
         chunks: dict[int, list[dict[str, object]]] = {}
         for event in shown:

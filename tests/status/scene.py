@@ -162,6 +162,7 @@ class Scene:
         self.shared = shared
         self.risk_cells = risk_cells
         self.n = 0
+        self.phase = MissionPhase.EXPLORE
         self.still: list[tuple[str, Message]] = [
             ("irm/coverage_window", coverage_window()),
             ("irm/global_irm", graph(graph_side)),
@@ -178,7 +179,7 @@ class Scene:
             show("riskmap/risk_map", risk_map(n, self.risk_cells))
             show("reconciler/plan", plan(n))
         if n % 5 == 0:
-            show("mission/state", mission(n))
+            show("mission/state", mission(n, self.phase))
             show("irm/local_irm", local_irm())
             for service in SERVICES:
                 show(f"{service}/health", health(service))
