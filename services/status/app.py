@@ -57,6 +57,7 @@ class LiveStatus:
         self._painter = Painter()
         self._told_s = -math.inf
         self.tick()  # its kernel is compiled before anybody looks
+        self._told_s = -math.inf
 
     @property
     def board(self) -> Board:

@@ -164,7 +164,7 @@ def test_updates_at_five_hertz_with_two_browsers_open(open_page: Callable[..., A
 
 
 def test_draws_a_large_map_in_under_ten_milliseconds(open_page: Callable[..., Any]) -> None:
-    page = open_page()
+    page = open_page(quiet=False)  # that it is read back so often is a warning
     until(page, MAP_SHOWN)
     risk, nodes = page.evaluate("[plgrim.store.get('risk').cells.length, plgrim.store.graph().x.length]")
     assert risk == 400 * 400
@@ -284,6 +284,7 @@ def test_a_polygon_can_be_drawn_with_the_keyboard_alone(open_page: Callable[...,
     page.keyboard.press("Enter")
     for key in ("Space", "ArrowRight", "ArrowRight", "Space", "ArrowDown", "ArrowDown", "Space", "Enter"):
         page.keyboard.press(key)
+    until(page, "document.querySelector('dialog').open")
     page.keyboard.type(TOKEN)
     page.keyboard.press("Enter")
     until(page, "document.querySelectorAll('.fences li').length === 1")
