@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from planning.polygons import Points, Rings, cells_inside, cells_on_border, cros
 PRIORITY_REACH_M = 10.0
 """So far from a priority polygon what leads towards it counts more by a third of what it does inside."""
 _STEP_M, _STEP_RAD = 0.01, 0.0005
+_SAME = Planar(0.0, 0.0, 0.0)
 
 
 class Polygon(NamedTuple):
@@ -154,3 +155,93 @@ def _moved(ring: Points, motion: Planar) -> Points:
     turn = np.array([[c, s], [-s, c]])
     out: Points = ring @ turn + np.array([motion.x_m, motion.y_m])
     return out
+
+
+class DrawnRing(Protocol):
+    """A ring as a message holds it."""
+
+    @property
+    def points(self) -> list[tuple[float, float]]: ...
+
+
+class Drawn(Protocol):
+    """A polygon as a message holds it (`schemas.fences.Fence`)."""
+
+    @property
+    def kind(self) -> str: ...
+    @property
+    def frame(self) -> str: ...
+    @property
+    def weight(self) -> float: ...
+    @property
+    def rings(self) -> Sequence[DrawnRing]: ...
+
+
+class FenceView:
+    """The fences as a planner has heard of them, asked about window by window.
+
+    version: of the fences held, -1 before any was heard of.
+    """
+
+    def __init__(self) -> None:
+        self.version = -1
+        self._polygons: tuple[Polygon, ...] = ()
+        self._shut: tuple[GridSpec, Planar, Shut | None] | None = None
+        self._placed: dict[tuple[Planar, bool], Placed] = {}
+
+    def update(self, version: int, fences: Sequence[Drawn]) -> bool:
+        """Take in what was told. Returns whether it is another version."""
+        if version == self.version:
+            return False
+        self.version = version
+        drawn = [(f.kind, f.frame, f.weight, [ring.points for ring in f.rings]) for f in fences]
+        self._polygons = tuple(polygon(*one) for one in drawn)
+        self._forget()
+        return True
+
+    def _forget(self) -> None:
+        self._shut = None
+        self._placed = {}
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no polygon at all."""
+        return not self._polygons
+
+    def placed(self, frame: Planar, in_odom: bool) -> Placed:
+        """The polygons in `odom` or `map`; frame: the pose of `odom` in `map`, taken to the nearest centimetre."""
+        native = all(p.in_odom == in_odom for p in self._polygons)
+        near = _SAME if native else stepped(frame)
+        if (near, in_odom) not in self._placed:
+            self._placed = {k: v for k, v in self._placed.items() if k[1] != in_odom}
+            self._placed[near, in_odom] = place(self._polygons, near, in_odom)
+        return self._placed[near, in_odom]
+
+    def shut(self, spec: GridSpec, frame: Planar) -> Shut | None:
+        """What is shut in a window in `odom`; None: nothing."""
+        if self.is_empty:
+            return None
+        near = stepped(frame)
+        if self._shut is None or self._shut[:2] != (spec, near):
+            self._shut = (spec, near, self.placed(frame, True).over(spec))
+        return self._shut[2]
+
+    def weights(self, spec: GridSpec, frame: Planar) -> NDArray[np.float32] | None:
+        """How many times each cell of a window in `odom` counts; None: once each."""
+        return None if self.is_empty else self.placed(frame, True).weights(spec)
+
+    def state(self) -> dict[str, Any]:
+        """For a snapshot."""
+        polygons = [
+            [p.kind, p.in_odom, p.weight, [ring.tolist() for ring in p.rings]] for p in self._polygons
+        ]
+        return {"version": self.version, "polygons": polygons}
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """From a snapshot."""
+        self.version = state["version"]
+        self._polygons = tuple(
+            polygon(kind, "odom" if in_odom else "map", weight, rings)
+            for kind, in_odom, weight, rings in state["polygons"]
+        )
+        self._forget()

@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from plgrim.commands import evaluate, feed, inspect, missions, services
+from plgrim.commands import evaluate, feed, inspect, missions, operator, services
 from plgrim.errors import PlgrimError
 
 application = typer.Typer(
@@ -16,7 +16,7 @@ application = typer.Typer(
     add_completion=False,
     pretty_exceptions_show_locals=False,
 )
-for room in (missions, services, feed, evaluate, inspect):
+for room in (missions, operator, services, feed, evaluate, inspect):
     room.register(application)
 
 

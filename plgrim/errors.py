@@ -45,6 +45,18 @@ class JournalError(PlgrimError):
     exit_code = 7
 
 
+class NoAnswerError(PlgrimError):
+    """A command was sent and nobody answered; whether it was carried out is not known."""
+
+    exit_code = 8
+
+
+class CommandRefusedError(PlgrimError):
+    """The mission refused a command; the text is its reason."""
+
+    exit_code = 1
+
+
 class ExplorerInputError(PlgrimError, ValueError):
     """A grid, a cloud or a pose that the `Explorer` cannot use; the text names the field."""
 

@@ -96,8 +96,9 @@ def _serve(
 
     server.shared.desk.send = lambda command: say(COMMAND, command)
     service.link.declare(COMMAND)
+    shared = server.shared
     service.link.serve(
-        command_key(service.config.robot), lambda payload: answer_json(server.shared.desk, payload)
+        command_key(service.config.robot), lambda payload: answer_json(shared.desk, payload, shared.fences)
     )
     for topic in read_by("status"):
         service.link.subscribe(topic, feed.accept)

@@ -10,11 +10,13 @@ import math
 from dataclasses import astuple, dataclass, field
 from typing import Any
 
+from planning.fences import Placed
 from planning.frames import Planar
 from planning.grid import FREE, LETHAL, UNKNOWN
 from services.irm.borders import Found, find_frontiers, least_gain
 from services.irm.config import Config
 from services.irm.keyframes import NOBODY, Anchor
+from services.irm.out_of_reach import FENCED, Place
 from services.irm.spatial import SpatialHash
 from services.irm.window import Window
 
@@ -71,11 +73,16 @@ class GivenUp:
 
 @dataclass(slots=True)
 class FrontierManager:
-    """Finds, names, prunes and gives up frontiers. dropped, dropped_gain: too little in a world that has grown."""
+    """Finds, names, prunes and gives up frontiers.
+
+    aside: those behind the operator's fences, until these change. dropped, dropped_gain: too little in a world that
+    has grown.
+    """
 
     config: Config
     frontiers: dict[int, Frontier] = field(default_factory=dict)
     given_up: list[GivenUp] = field(default_factory=list)
+    aside: list[GivenUp] = field(default_factory=list)
     dropped: int = 0
     dropped_gain: float = 0.0
     _places: SpatialHash = field(default_factory=SpatialHash)
@@ -126,6 +133,30 @@ class FrontierManager:
         self._watch(window, robot, now_ns, elapsed_s)
         return next_id
 
+    def fence(
+        self, placed: Placed, changed: bool, reopened: list[Place], next_id: int
+    ) -> tuple[int, list[int]]:
+        """Put frontiers where the robot may not be aside. When other fences hold now (`changed`), what they let free
+        comes back: what was aside, what no way led to, and places behind a fence that is gone.
+
+        Returns the next id, and the ids of those that came back.
+        """
+        for f in [f for f in self.frontiers.values() if placed.forbids(f.x_m, f.y_m)] if placed.shuts else []:
+            self.aside.append(_given_up(f, FENCED, 0))
+            self._forget(f.node_id)
+        if not changed:
+            return next_id, []
+        free = [g for g in self.aside if not placed.forbids(g.x_m, g.y_m)]
+        free += [g for g in self.given_up if g.reason in _NO_WAY and not placed.forbids(g.x_m, g.y_m)]
+        self.aside = [g for g in self.aside if g not in free]
+        self.given_up = [g for g in self.given_up if g not in free]
+        free += [_place_given_up(p) for p in reopened]
+        back = list(range(next_id, next_id + len(free)))
+        for node_id, g in zip(back, free, strict=True):
+            self._keep(_frontier_again(node_id, g, g.again))
+        self._changed |= set(self.frontiers)  # priorities may have changed what they are told to be worth
+        return next_id + len(free), back
+
     def near(self, window: Window) -> list[int]:
         """The frontiers that lie in the window, those of doubtful place only when the robot is beside them.
 
@@ -162,6 +193,9 @@ class FrontierManager:
                     continue
             kept.append(g)
         self.given_up = kept
+        for g in self.aside:
+            if g.keyframe in keyframes:
+                g.x_m, g.y_m = keyframes[g.keyframe].apply(g.local_x_m, g.local_y_m)
         moved = [k for k in sorted(self.frontiers) if self.frontiers[k].keyframe in keyframes]
         for node_id in moved:
             f = self.frontiers[node_id]
@@ -187,9 +221,7 @@ class FrontierManager:
             return next_id
         for g in [g for g in self.given_up if g.gain >= self.config.second_chance_gain and not g.again]:
             self.given_up.remove(g)
-            back = Frontier(next_id, g.x_m, g.y_m, g.gain, again=True, keyframe=g.keyframe)
-            back.local_x_m, back.local_y_m = g.local_x_m, g.local_y_m
-            self._keep(back)
+            self._keep(_frontier_again(next_id, g, True))
             next_id += 1
         return next_id
 
@@ -293,17 +325,15 @@ class FrontierManager:
     def give_up(self, frontier: Frontier, reason: str, now_ns: int) -> None:
         """Take a frontier off the list for a while."""
         until = now_ns + int(self.config.retry_after_s * 1e9)
-        f = frontier
-        self.given_up.append(
-            GivenUp(f.x_m, f.y_m, f.gain, reason, until, f.again, f.keyframe, f.local_x_m, f.local_y_m)
-        )
-        self._forget(f.node_id)
+        self.given_up.append(_given_up(frontier, reason, until))
+        self._forget(frontier.node_id)
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
         return {
             "frontiers": [list(astuple(f)) for _, f in sorted(self.frontiers.items())],
             "given_up": [list(astuple(g)) for g in self.given_up],
+            "aside": [list(astuple(g)) for g in self.aside],
             "dropped": [self.dropped, self.dropped_gain, self._least],
         }
 
@@ -315,9 +345,25 @@ class FrontierManager:
             self.frontiers[f.node_id] = f
             self._places.put(f.node_id, f.x_m, f.y_m)
         self.given_up = [GivenUp(*g) for g in state["given_up"]]
+        self.aside = [GivenUp(*g) for g in state.get("aside", ())]  # older journals have none
         self.dropped, self.dropped_gain, self._least = state["dropped"]
         self._pursued = {k for k, f in self.frontiers.items() if f.pursued_s > 0.0}
         self._changed = set(self.frontiers)
+
+
+def _given_up(f: Frontier, reason: str, until_ns: int) -> GivenUp:
+    return GivenUp(f.x_m, f.y_m, f.gain, reason, until_ns, f.again, f.keyframe, f.local_x_m, f.local_y_m)
+
+
+def _place_given_up(p: Place) -> GivenUp:
+    return GivenUp(p.x_m, p.y_m, p.gain, FENCED, 0, False, p.keyframe, p.local_x_m, p.local_y_m)
+
+
+def _frontier_again(node_id: int, g: GivenUp, again: bool) -> Frontier:
+    """What was given up as a frontier once more, under a new id."""
+    back = Frontier(node_id, g.x_m, g.y_m, g.gain, again=again, keyframe=g.keyframe)
+    back.local_x_m, back.local_y_m = g.local_x_m, g.local_y_m
+    return back
 
 
 def _in_window(window: Window, frontier: Frontier) -> bool:

@@ -38,6 +38,8 @@ class RoadGraph:
         self._changed: set[Key] = set()
         self._new_ways: set[tuple[int, int]] = set()
         self._published: dict[Any, tuple[Any, ...]] = {}
+        self.shut: set[tuple[int, int]] = set()
+        """Edges that lead through a fence: kept, but neither told nor gone along."""
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
@@ -121,16 +123,43 @@ class RoadGraph:
 
     def drop_edge(self, a: int, b: int) -> None:
         """Remove an edge."""
+        key = min(a, b), max(a, b)
+        was_shut = key in self.shut
         self.graph.remove_edge(a, b)
-        self._changed.add((min(a, b), max(a, b)))
-        if self._is_crumb(a) and self._is_crumb(b):
+        self.shut.discard(key)
+        self._changed.add(key)
+        if not was_shut and self._is_crumb(a) and self._is_crumb(b):
             self._components.part(a, b, self._crumbs_beside)
+
+    def shut_edges(self, edges: set[tuple[int, int]]) -> None:
+        """These edges are shut from now on, and no others."""
+        for a, b in sorted(edges - self.shut):
+            self.shut.add((a, b))
+            self._changed.add((a, b))
+            if self._is_crumb(a) and self._is_crumb(b):
+                self._components.part(a, b, self._crumbs_beside)
+        for a, b in sorted(self.shut - edges):
+            self.open_edge(a, b)
+
+    def open_edge(self, a: int, b: int) -> None:
+        """An edge is not shut any more."""
+        key = min(a, b), max(a, b)
+        if key not in self.shut:
+            return
+        self.shut.discard(key)
+        self._changed.add(key)
+        if self._is_crumb(a) and self._is_crumb(b):
+            self._components.join(a, b)
+
+    def is_open(self, a: int, b: int) -> bool:
+        """Whether an edge is not shut."""
+        return not self.shut or (min(a, b), max(a, b)) not in self.shut
 
     def _is_crumb(self, node: int) -> bool:
         return node != ROBOT and bool(self.graph.nodes[node]["kind"] == BREADCRUMB)
 
     def _crumbs_beside(self, node: int) -> list[int]:
-        return [n for n in self.graph.neighbors(node) if self._is_crumb(n)]
+        return [n for n in self.graph.neighbors(node) if self._is_crumb(n) and self.is_open(node, n)]
 
     def components_of(self, node: int) -> set[int]:
         """Which components of the breadcrumbs' graph a node is joined to, by numbers that hold until it changes."""
@@ -145,7 +174,8 @@ class RoadGraph:
         """Whether a way leads from the robot, in these components, to a frontier; no other frontier may lie on it."""
         if self.graph.has_edge(ROBOT, frontier):
             return True
-        return any(self._components.label(n) in components for n in self.graph.neighbors(frontier))
+        beside = [n for n in self.graph.neighbors(frontier) if self.is_open(frontier, n)]
+        return any(self._components.label(n) in components for n in beside)
 
     # --- what is told -----------------------------------------------------------------------------------------
 
@@ -193,7 +223,9 @@ class RoadGraph:
         yield from ((min(a, b), max(a, b)) for a, b in self.graph.edges)
 
     def _exists(self, key: Key) -> bool:
-        return key in self.graph if isinstance(key, int) else self.graph.has_edge(*key)
+        if isinstance(key, int):
+            return key in self.graph
+        return self.graph.has_edge(*key) and self.is_open(*key)
 
     def _values(self, key: Key) -> tuple[Any, ...]:
         if isinstance(key, tuple):
@@ -223,7 +255,7 @@ class RoadGraph:
 
     def set_published(self, unpublished: list[list[Any]]) -> None:
         """All that the graph holds was told in the last message, but for this (see `state`)."""
-        self._published = {k: self._values(k) for k in self._all_keys()}
+        self._published = {k: self._values(k) for k in self._all_keys() if self._exists(k)}
         self._changed = set()
         for key, values in unpublished:
             name = tuple(key) if isinstance(key, list) else key
@@ -243,7 +275,7 @@ class RoadGraph:
             "nodes": [[n, dict(self.graph.nodes[n])] for n in message.node_id.tolist()],
             "edges": [[a, b, dict(self.graph.edges[a, b])] for a, b in edges],
             "removed_nodes": message.removed_node.tolist(),
-            "removed_edges": message.removed_edge.tolist(),
+            "removed_edges": [e for e in message.removed_edge.tolist() if not self.graph.has_edge(*e)],
         }
 
     def apply_difference(self, difference: dict[str, Any]) -> None:

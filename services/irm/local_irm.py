@@ -49,7 +49,8 @@ class LocalIrmBuilder:
             c.spacing_m, s.ix0, s.iy0, c.size, c.edge_detour, state, anchor, distance, risk,
             bent_edge, bent_start, bent_xy,
         )  # fmt: skip
-        entropy = self._patch_sum(window, window.entropy, ix0, iy0, window.uncovered)[0].astype(np.float32)
+        counted = window.entropy if window.weight is None else window.entropy * window.weight
+        entropy = self._patch_sum(window, counted, ix0, iy0, window.uncovered)[0].astype(np.float32)
         entropy[entropy < c.min_node_entropy] = 0.0
         reach = math.ceil(c.sensor_range_m / c.spacing_m)
         self.version += 1

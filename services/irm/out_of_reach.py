@@ -12,15 +12,19 @@ from scipy import ndimage
 
 from planning.clusters import label_components
 from planning.coverage import LOG_2
+from planning.fences import Placed
 from planning.frames import Planar
-from planning.grid import FREE, LETHAL
+from planning.grid import FREE, LETHAL, GridSpec
 from services.irm.keyframes import NOBODY, Anchor
 from services.irm.window import Window, connected_free_space, dilate_disc, without_slivers
 
 TOO_NARROW = "out of reach: no way to it that the robot fits through"
+FENCED = "behind a fence of the operator"
 _LEAST_M2 = 1.0
 """Less is a corner that the body does not get into."""
 _SAME_M = 3.0
+_BESIDE_M = 0.8
+"""Ground behind a fence begins so near to it."""
 _MOST = 64
 
 
@@ -28,7 +32,7 @@ _MOST = 64
 class Place:
     """The nearest point of such ground, in `map`, and what it would be worth, nats of whole patches.
 
-    keyframe: what it belongs to; local_*: its place in that keyframe's frame.
+    keyframe: what it belongs to; local_*: its place in that keyframe's frame. fenced: only a fence is in the way.
     """
 
     x_m: float
@@ -37,6 +41,12 @@ class Place:
     keyframe: int = NOBODY
     local_x_m: float = 0.0
     local_y_m: float = 0.0
+    fenced: bool = False
+
+    @property
+    def reason(self) -> str:
+        """Why the robot does not get there."""
+        return FENCED if self.fenced else TOO_NARROW
 
 
 class OutOfReach:
@@ -49,12 +59,18 @@ class OutOfReach:
     def update(self, window: Window, needed_m: float, radius_m: float, anchor: Anchor) -> None:
         """Look at the window again; what was found elsewhere stays. needed_m: clearance of the robot's centre."""
         kept = [p for p in self.places if not window.spec.contains(*window.cell(p.x_m, p.y_m))]
-        for x_m, y_m, area_m2 in closed_off(window, needed_m, radius_m):
+        for x_m, y_m, area_m2, fenced in closed_off(window, needed_m, radius_m):
             at = window.to_map(x_m, y_m)
             if all(math.dist(at, (p.x_m, p.y_m)) > _SAME_M for p in kept):
                 gain = area_m2 * LOG_2 / self._spacing_m**2
-                kept.append(Place(*at, gain, anchor.keyframe, *anchor.local(*at)))
+                kept.append(Place(*at, gain, anchor.keyframe, *anchor.local(*at), fenced))
         self.places = sorted(kept, key=lambda p: (-p.gain, p.x_m, p.y_m))[:_MOST]
+
+    def reopened(self, placed: Placed) -> list[Place]:
+        """Other fences hold now: the places that none of them is beside any more, which are no longer kept here."""
+        free = [p for p in self.places if p.fenced and not _beside(placed, p)]
+        self.places = [p for p in self.places if p not in free]
+        return free
 
     def follow(self, keyframes: dict[int, Planar]) -> None:
         """Move what belongs to keyframes that SLAM has moved."""
@@ -71,18 +87,41 @@ class OutOfReach:
         self.places = [Place(*values) for values in state]
 
 
-def closed_off(window: Window, needed_m: float, radius_m: float) -> list[tuple[float, float, float]]:
-    """(x, y, area m2) in `odom` of each piece of free ground that the robot cannot touch, as far as is known.
+def _beside(placed: Placed, place: Place) -> bool:
+    return placed.forbids(place.x_m, place.y_m) or placed.border_m(place.x_m, place.y_m) < _BESIDE_M
+
+
+def closed_off(window: Window, needed_m: float, radius_m: float) -> list[tuple[float, float, float, bool]]:
+    """(x, y, area m2, only by fences) in `odom` of each piece of free ground that the robot cannot touch, as far as is
+    known.
 
     Where nothing is known there may be a way. x, y: the cell of the piece that is nearest to ground within reach.
     """
-    s = window.spec
-    perhaps = connected_free_space(
-        (window.state != LETHAL) & (window.clearance_m >= needed_m), window.robot_cell
-    )
-    touched = np.zeros(s.shape, dtype=np.bool_)
-    dilate_disc(perhaps | window.reachable, radius_m / s.resolution_m, touched)
-    closed: NDArray[np.bool_] = without_slivers((window.state == FREE) & ~touched)
+    free = window.state == FREE
+    if window.shut is None or window.open_clearance_m is None:
+        touched = _touched(window, window.clearance_m, needed_m, radius_m)
+        return [(*piece, False) for piece in _pieces(window.spec, free & ~touched, touched)]
+    touched = _touched(window, window.open_clearance_m, needed_m, radius_m)
+    inside = _touched(window, window.clearance_m, needed_m, radius_m) & ~window.shut
+    narrow = _pieces(window.spec, free & ~touched, touched)
+    fenced = _pieces(window.spec, free & touched & ~inside, inside)
+    return [*((*piece, False) for piece in narrow), *((*piece, True) for piece in fenced)]
+
+
+def _touched(
+    window: Window, clearance_m: NDArray[np.float32], needed_m: float, radius_m: float
+) -> NDArray[np.bool_]:
+    """What the body may touch by any way that is left open."""
+    perhaps = connected_free_space((window.state != LETHAL) & (clearance_m >= needed_m), window.robot_cell)
+    touched = np.zeros(window.spec.shape, dtype=np.bool_)
+    dilate_disc(perhaps | window.reachable, radius_m / window.spec.resolution_m, touched)
+    return touched
+
+
+def _pieces(
+    s: GridSpec, cells: NDArray[np.bool_], touched: NDArray[np.bool_]
+) -> list[tuple[float, float, float]]:
+    closed: NDArray[np.bool_] = without_slivers(cells)
     least = round(_LEAST_M2 / s.resolution_m**2)
     if np.count_nonzero(closed) < least:
         return []

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import networkx as nx
+import numpy as np
 
+from planning.fences import Placed
 from planning.frames import Planar
 from schemas.base import Pose
 from schemas.world import BREADCRUMB, FRONTIER, GlobalIrm
 from services.irm.config import Config
-from services.irm.driven import REFUTED, Trail, placed
+from services.irm.driven import REFUTED, Trail
+from services.irm.driven import placed as placed_way
 from services.irm.frontiers import ISOLATED, Frontier, FrontierManager
 from services.irm.graph import ROBOT, RoadGraph
 from services.irm.keyframes import Anchor
+from services.irm.out_of_reach import Place
 from services.irm.search import Search, path_totals
 from services.irm.window import Window
 
@@ -31,6 +36,8 @@ _LEVEL_M = 0.1
 """Heights of frontiers change by such steps, so that the noise of the risk map is not told every second."""
 _MOST_RISK = 0.95
 """Of an edge that was driven, however its ground looks now."""
+_GUESSED_TIMES, _GUESSED_RISK = 1.3, 0.1
+"""Length, against the straight line, and risk of an edge that nobody has looked for yet."""
 _CUT_OFF_TIMES = 10
 """So many times longer frontiers are kept while the robot is cut off."""
 
@@ -50,6 +57,11 @@ class Roadmap:
     last_breadcrumb: int = -1
     trail: Trail = field(default_factory=Trail)
     refuted: dict[tuple[int, int], int] = field(default_factory=dict)
+    fences: Placed = field(default_factory=Placed)
+    clear: set[tuple[int, int]] = field(default_factory=set)
+    """Edges that were found under the fences that hold now: they lead around."""
+    _moved: bool = False
+    _back: list[int] = field(default_factory=list)
     _doubtful: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
@@ -87,14 +99,65 @@ class Roadmap:
         self.trail.note(x_m, y_m)
         self._drop_breadcrumb(search, x_m, y_m, anchor)
         self._sync_frontiers(window)
+        self._join_back()
         self._join_robot(search)
         self._join_frontiers(window)
         self._give_up_isolated(now_ns)
         self._review_edges(window)
 
+    def fence(self, placed: Placed, changed: bool, reopened: list[Place]) -> None:
+        """The fences as they lie in `map` now; changed: they are others than before. reopened: places behind fences
+        that are gone. To be called before `update`.
+
+        Edges through them are shut: kept, as a fence can be taken away, but not told to anybody.
+        """
+        moved = self._moved or placed is not self.fences
+        self.fences, self._moved = placed, False
+        self.next_id, back = self.manager.fence(placed, changed, reopened, self.next_id)
+        self._back += back
+        if changed:
+            self.clear.clear()
+        if changed or (moved and placed.shuts):
+            self.road.shut_edges(self._edges_through(placed) if placed.shuts else set())
+
+    def _edges_through(self, placed: Placed) -> set[tuple[int, int]]:
+        """Edges between breadcrumbs and frontiers whose line meets what is shut, but for those found since."""
+        keys: list[tuple[int, int]] = []
+        lines: list[tuple[tuple[float, float], tuple[float, float]]] = []
+        for a, b, edge in self.graph.edges(data=True):
+            low, high = min(a, b), max(a, b)
+            if low == ROBOT or (low, high) in self.clear:
+                continue
+            ends = self.road.place(low), self.road.place(high)
+            way = placed_way(*ends, edge["way"]) if edge.get("way") else [*ends]
+            for p, q in pairwise(way):
+                keys.append((low, high))
+                lines.append((p, q))
+        if not lines:
+            return set()
+        points = np.array(lines, dtype=np.float64)
+        meets = placed.forbids_lines(points[:, 0], points[:, 1])
+        return {keys[i] for i in np.flatnonzero(meets).tolist()}
+
+    def _join_back(self) -> None:
+        """Frontiers that came back are joined to what lies near, as if there were a way: beside them it is seen."""
+        for node in [n for n in self._back if n in self.graph]:
+            x, y = self.road.place(node)
+            z = self.graph.nodes[node]["z"]
+            for _, other in self._near(x, y, z, 3.0 * self.config.max_edge_m, BREADCRUMB)[:3]:
+                straight = max(self.road.straight_m(node, other), 1e-3)
+                if not self._is_fenced(node, other):
+                    self.road.set_edge(node, other, _GUESSED_TIMES * straight, _GUESSED_RISK, 0)
+        self._back = []
+
+    def _is_fenced(self, a: int, b: int) -> bool:
+        ends = np.array([self.road.place(a)]), np.array([self.road.place(b)])
+        return self.fences.shuts and bool(self.fences.forbids_lines(*ends)[0])
+
     def follow(self, keyframes: dict[int, Planar]) -> None:
         """Move what belongs to keyframes that SLAM has moved (new poses in `map`)."""
         self.trail = Trail()
+        self._moved = True
         frontiers = [n for n in self.manager.follow(keyframes) if n in self.graph]
         crumbs = self.road.belonging(keyframes)
         before = {
@@ -174,9 +237,14 @@ class Roadmap:
             driven = self.graph.edges[a, b]["driven"] if self.graph.has_edge(a, b) else 0
             self.road.set_edge(a, b, self._climbed_m(a, b, d), rho, driven)
             self.refuted.pop((min(a, b), max(a, b)), None)
+            if self.fences.shuts:
+                self.road.open_edge(a, b)
+                self.clear.add((min(a, b), max(a, b)))
             return True
         if not (self.graph.has_edge(a, b) and search.knows(*target)):
             return False
+        if not self.road.is_open(a, b):
+            return False  # that a fence is in the way says nothing of the ground
         held = self.graph.edges[a, b]
         if math.isfinite(d):
             self.refuted.pop((min(a, b), max(a, b)), None)
@@ -194,7 +262,7 @@ class Roadmap:
         """Whether something stands, time after time, where the robot went from a to b."""
         low, high = (self.road.place(n) for n in (min(a, b), max(a, b)))
         held = self.graph.edges[a, b]
-        way = placed(low, high, held["way"]) if held.get("way") else [low, high]
+        way = placed_way(low, high, held["way"]) if held.get("way") else [low, high]
         times = self.refuted.pop((min(a, b), max(a, b)), 0) + 1
         if search.obstacle_on(way) and times < REFUTED:
             self.refuted[min(a, b), max(a, b)] = times
@@ -217,7 +285,8 @@ class Roadmap:
         for node in sorted(self.manager.take_changes()):
             f = self.manager.frontiers.get(node)
             if f is not None:
-                self.road.set_node(node, f.x_m, f.y_m, self._level_m(window, f), FRONTIER, f.gain, 0.5)
+                worth = f.gain * self.fences.boost(f.x_m, f.y_m)
+                self.road.set_node(node, f.x_m, f.y_m, self._level_m(window, f), FRONTIER, worth, 0.5)
             elif node in self.graph:
                 self.road.drop_node(node)
 
@@ -345,6 +414,10 @@ class Roadmap:
             "counters": [self.next_id, self.version, self.last_breadcrumb],
             "trail": self.trail.points,
             "refuted": sorted([*edge, times] for edge, times in self.refuted.items()),
+            "shut": sorted(list(edge) for edge in self.road.shut),
+            "clear": sorted(list(edge) for edge in self.clear),
+            "back": self._back,
+            "moved": self._moved,
         }
 
     def _set_beside_graph(self, state: dict[str, Any]) -> None:
@@ -352,6 +425,10 @@ class Roadmap:
         self.next_id, self.version, self.last_breadcrumb = state["counters"]
         self.trail.points = [(x, y) for x, y in state.get("trail", ())]  # older journals have none
         self.refuted = {(a, b): times for a, b, times in state.get("refuted", ())}
+        shut = {(a, b) for a, b in state.get("shut", ())}
+        self.road.shut_edges({edge for edge in shut if self.graph.has_edge(*edge)})
+        self.clear = {(a, b) for a, b in state.get("clear", ())}
+        self._back, self._moved = list(state.get("back", ())), bool(state.get("moved"))
 
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot."""

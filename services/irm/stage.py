@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from planning.fences import FenceView
 from planning.frames import Planar
 from planning.grid import UNKNOWN
 from schemas.base import Pose
@@ -20,6 +21,7 @@ from schemas.topics import (
     COVERAGE,
     COVERAGE_SCAN,
     COVERAGE_WINDOW,
+    FENCES,
     FOLLOWER,
     GCP_GRAPH_REQUEST,
     GLOBAL_IRM,
@@ -40,7 +42,7 @@ from services.irm.footprints import FootprintStore
 from services.irm.ground import GroundStore
 from services.irm.keyframes import Anchor, Keyframes, OdomInMap, is_near
 from services.irm.local_irm import LocalIrmBuilder
-from services.irm.out_of_reach import TOO_NARROW, OutOfReach
+from services.irm.out_of_reach import FENCED, OutOfReach
 from services.irm.resample import moved
 from services.irm.roadmap import Roadmap
 from services.irm.tiles import TileLayer
@@ -92,6 +94,8 @@ class IrmStage:
         self._local: LocalIrmBuilder | None = None
         self._roadmap = Roadmap(config)
         self._out_of_reach = OutOfReach(config.spacing_m)
+        self._fences = FenceView()
+        self._fenced_version = -1
         self._keyframes = Keyframes()
         self._odom = OdomInMap()
         self._doubtful: frozenset[int] = frozenset()
@@ -114,6 +118,9 @@ class IrmStage:
             self._read_pose_graph(inputs)
             return [Output(GLOBAL_IRM, whole)]
         self._read_pose_graph(inputs)
+        told = inputs.latest(FENCES)
+        if told is not None:
+            self._fences.update(told.message.version, told.message.fences)
         if risk is None or odometry is None:
             return []
         self._allocate(risk)
@@ -207,7 +214,7 @@ class IrmStage:
         window = build_window(
             risk, odometry.pose.x_m, odometry.pose.y_m, self._config, known,
             read_layer(self._coverage, spec, frame), [(x, y) for _, x, y in self._penalties], frame,
-            odometry.map_to_odom.z_m,
+            odometry.map_to_odom.z_m, self._fences.shut(spec, frame), self._fences.weights(spec, frame),
         )  # fmt: skip
         self._ground_store.write(spec, np.where(risk.state != UNKNOWN, known, np.uint8(0)), frame, anchor)
         return window
@@ -254,6 +261,7 @@ class IrmStage:
             self._covered_m2 = covered_m2
             self._roadmap.manager.progressed()
         self._pursue(now, inputs, elapsed)
+        self._fence()
         self._roadmap.update(window, place.x_m, place.y_m, now, elapsed, ground_m2, anchor, self._doubtful)
         first = self._roadmap.version == 0
         message = self._roadmap.message(odometry.pose, self._frame_pose(odometry), now, whole or first)
@@ -264,6 +272,15 @@ class IrmStage:
             Output(COVERAGE, self._summary(now, ground_m2, covered_m2)),
             Output(COVERAGE_WINDOW, CoverageWindow(stamp_ns=now, grid=header, cell=picture)),
         ]
+
+    def _fence(self) -> None:
+        """The fences as they lie in `map` now, and what comes back when they have changed."""
+        placed = self._fences.placed(self._odom.pose, False)
+        changed = self._fenced_version != self._fences.version
+        if self._fenced_version < 0 and self._fences.is_empty:
+            changed = False  # the first word is that there are none
+        self._fenced_version = self._fences.version
+        self._roadmap.fence(placed, changed, self._out_of_reach.reopened(placed) if changed else [])
 
     def _pursue(self, now: Stamp, inputs: Inputs, elapsed_s: float) -> None:
         """The time that the robot has been after its target; where the local planner finds no way there, it goes on
@@ -282,7 +299,8 @@ class IrmStage:
 
     def _summary(self, now: Stamp, reachable: float, covered: float) -> CoverageSummary:
         given_up = [(g.x_m, g.y_m, g.gain, g.reason) for g in self._roadmap.manager.given_up]
-        given_up += [(p.x_m, p.y_m, p.gain, TOO_NARROW) for p in self._out_of_reach.places]
+        given_up += [(g.x_m, g.y_m, g.gain, FENCED) for g in self._roadmap.manager.aside]
+        given_up += [(p.x_m, p.y_m, p.gain, p.reason) for p in self._out_of_reach.places]
         frontiers = self._roadmap.manager.frontiers
         left = float(sum(f.gain for f in frontiers.values()))
         if self._config.coverage == "known":  # what is known is covered; what is expected behind it is not
@@ -310,6 +328,8 @@ class IrmStage:
             "keyframes": self._keyframes.state(),
             "odom": self._odom.state(),
             "out_of_reach": self._out_of_reach.state(),
+            "fences": self._fences.state(),
+            "fenced_version": self._fenced_version,
             "penalties": self._penalties,
             "backwards": self._backwards,
             "pending": [scan.model_dump() for scan in self._pending],
@@ -333,6 +353,7 @@ class IrmStage:
         self._keyframes.set_state(state["keyframes"])
         self._odom.set_state(state["odom"])
         self._out_of_reach.set_state(state["out_of_reach"])
+        self._set_fences(state)
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
         self._backwards = bool(state["backwards"])
         self._pending = [CoverageScan(**scan) for scan in state["pending"]]
@@ -361,6 +382,8 @@ class IrmStage:
             "keyframes": self._keyframes.take_changes(),
             "odom": self._odom.state(),
             "out_of_reach": self._out_of_reach.state(),
+            "fences": self._fences.state(),
+            "fenced_version": self._fenced_version,
             "resolution": self._ground.resolution_m,
             "radius": self._local.footprint_radius_m,
             "version": self._local.version,
@@ -383,9 +406,17 @@ class IrmStage:
         self._keyframes.apply_changes(state["keyframes"])
         self._odom.set_state(state["odom"])
         self._out_of_reach.set_state(state["out_of_reach"])
+        self._set_fences(state)
         self._local.version = state["version"]
         self._global_ns, self._covered_m2 = state["global_ns"], state["covered_m2"]
         self._penalties = [(int(t), x, y) for t, x, y in state["penalties"]]
+
+    def _set_fences(self, state: dict[str, Any]) -> None:
+        if "fences" not in state:  # older journals have none
+            return
+        self._fences.set_state(state["fences"])
+        self._fenced_version = state["fenced_version"]
+        self._roadmap.fences = self._fences.placed(self._odom.pose, False)
 
     def resumed(self) -> None:
         """Versions of the Local IRM that were given since the last record are not given again."""

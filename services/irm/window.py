@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from planning.clusters import flood_fill
 from planning.coverage import entropy, probability
+from planning.fences import Shut
 from planning.footprint import footprint_hazard
 from planning.frames import Planar
 from planning.grid import FREE, LETHAL, UNKNOWN, GridSpec
@@ -44,6 +45,8 @@ class Window:
     probability, slivers of one cell left out; with `coverage: known` the hopeful ground behind the border of the known
     (see `unknown`). entropy: of uncovered cells, nats of whole patches (0 elsewhere).
     top_m: what the coverage sensor has to look over; None: whatever is not free blocks the sight.
+    shut: cells where the operator's fences let no robot be; clearance_m is that to obstacles and to these.
+    open_clearance_m: that to obstacles alone. weight: so many times a cell counts; None: once each.
     hazard: CVaR of the hazard rate, its mean under the body, 1/m. step_cost: cost per metre of the grid search.
     """
 
@@ -62,6 +65,9 @@ class Window:
     robot_cell: tuple[int, int]
     elevation_m: NDArray[np.float32]
     top_m: NDArray[np.float32] | None = None
+    shut: NDArray[np.bool_] | None = None
+    open_clearance_m: NDArray[np.float32] | None = None
+    weight: NDArray[np.float32] | None = None
     frame: Planar = IDENTITY
     frame_z_m: float = 0.0
     _from_map: Planar = field(init=False)
@@ -122,13 +128,17 @@ def build_window(
     penalties: list[tuple[float, float]],
     frame: Planar = IDENTITY,
     frame_z_m: float = 0.0,
+    shut: Shut | None = None,
+    weight: NDArray[np.float32] | None = None,
 ) -> Window:
     """The layers around the robot from a risk map and what was known before.
 
     x_m, y_m: the robot in `odom`. layer: what was known of the ground, over the risk map's grid; brought up to date
     in place. log_odds: of coverage. penalties: places (x, y) in `odom` where the robot was blocked lately; their
-    hazard is raised.
+    hazard is raised. shut: by the operator's fences: no ground there, and the body keeps off. weight: of cells.
     """
+    fence = np.zeros(1, np.bool_) if shut is None else shut.mask
+    clearance_m = risk.clearance_m if shut is None else np.minimum(risk.clearance_m, shut.distance_m)
     spec = grid_of(risk)
     g = risk.grid
     before = layer == GROUND
@@ -139,21 +149,20 @@ def build_window(
         _raise_hazard(hazard, spec, px, py)
     needed = risk.footprint_radius_m + config.clearance_margin_m
     relaxed = needed - config.clearance_hysteresis_m
-    passable = (risk.state == FREE) & (
-        (risk.clearance_m >= needed) | (before & (risk.clearance_m >= relaxed))
-    )
+    passable = (risk.state == FREE) & ((clearance_m >= needed) | (before & (clearance_m >= relaxed)))
+    passable &= ~fence
     robot = spec.cell_of(x_m, y_m)
     free_space = connected_free_space(passable, robot)
-    forgotten = before & (risk.state == UNKNOWN)
+    forgotten = before & (risk.state == UNKNOWN) & ~fence
     reachable = connected_free_space(passable | forgotten, robot)
     ground = np.zeros(spec.shape, dtype=np.bool_)
     dilate_disc(reachable, risk.footprint_radius_m / g.resolution_m, ground)
-    ground &= risk.state == FREE
+    ground &= (risk.state == FREE) & ~fence
     ground |= forgotten
     layer[risk.state != UNKNOWN] = KNOWN
     layer[ground] = GROUND
     unseen = layer == 0
-    hopeful = (solid(unseen) if config.unknown_solid else unseen) & (risk.clearance_m >= needed)
+    hopeful = (solid(unseen) if config.unknown_solid else unseen) & (clearance_m >= needed) & ~fence
     hopeful &= connected_free_space(reachable | hopeful, robot)
     cell_share = (g.resolution_m / config.spacing_m) ** 2
     if config.coverage == "known":
@@ -170,9 +179,9 @@ def build_window(
         spec=spec,
         state=risk.state,
         hopeful=hopeful,
-        clearance_m=risk.clearance_m,
+        clearance_m=clearance_m,
         hazard=hazard,
-        step_cost=_step_cost(hazard, risk.clearance_m, needed, config.comfort_clearance_m),
+        step_cost=_step_cost(hazard, clearance_m, needed, config.comfort_clearance_m),
         free_space=free_space,
         reachable=reachable,
         ground=ground,
@@ -182,6 +191,9 @@ def build_window(
         robot_cell=robot,
         elevation_m=risk.elevation_m,
         top_m=tops_of(risk),
+        shut=None if shut is None else shut.mask,
+        open_clearance_m=None if shut is None else risk.clearance_m,
+        weight=weight,
         frame=frame,
         frame_z_m=frame_z_m,
     )

@@ -96,7 +96,9 @@ class Driven:
         if end != self.end:
             self.end, self.changed = end, True
             if hazard >= 0:
-                self.why = f"hazard {(hazard - self.at) * STEP_M:.1f} m ahead"
+                x_m, y_m = points[hazard].tolist()
+                what = "fence" if ground.is_shut(x_m, y_m, least_m) else "hazard"
+                self.why = f"{what} {(hazard - self.at) * STEP_M:.1f} m ahead"
 
     @staticmethod
     def _clearance_m(ground: Ground, at: NDArray[np.float64]) -> float:

@@ -9,23 +9,57 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.fences import Shut
 from planning.footprint import bilinear, segment_min_clearance
-from planning.grid import FREE, GridSpec
+from planning.grid import FREE, LETHAL, GridSpec
 from planning.kernels import njit
+from schemas.world import RiskMap
 from services.reconciler.config import Config
 
 STEP_M = 0.1
 """Spacing of the points of a path."""
 _FREE = FREE
+_WAY_OUT_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """The risk map as the path functions need it. state (h, w), clearance_m (h, w)."""
+    """The risk map as the path functions need it. state (h, w), clearance_m (h, w): the operator's fences are obstacles
+    in both. shut (h, w): where only a fence is in the way; None: nowhere."""
 
     spec: GridSpec
     state: NDArray[np.uint8]
     clearance_m: NDArray[np.float32]
+    shut: NDArray[np.bool_] | None = None
+
+    def is_shut(self, x_m: float, y_m: float, within_m: float) -> bool:
+        """Whether a fence lies so near to a point."""
+        if self.shut is None:
+            return False
+        row, column = self.spec.cell_of(x_m, y_m)
+        reach = math.ceil(within_m / self.spec.resolution_m)
+        rows = slice(max(0, row - reach), max(0, row + reach + 1))
+        return bool(self.shut[rows, max(0, column - reach) : max(0, column + reach + 1)].any())
+
+
+def fenced_ground(risk: RiskMap, shut: Shut | None, robot: tuple[float, float]) -> Ground:
+    """A risk map with what the fences shut as obstacles.
+
+    A robot that stands in a fence all the same (a closure has moved one of the two) may leave: the fence does not count
+    near to it.
+    """
+    g = risk.grid
+    spec = GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
+    if shut is None:
+        return Ground(spec, risk.state, risk.clearance_m)
+    mask, distance_m = shut.mask, shut.distance_m
+    row, column = spec.cell_of(*robot)
+    if spec.contains(row, column) and mask[row, column]:
+        rows, columns = np.ogrid[: spec.height, : spec.width]
+        near = np.hypot(rows - row, columns - column) * spec.resolution_m <= _WAY_OUT_M
+        mask, distance_m = mask & ~near, np.where(near, np.float32(np.inf), distance_m)
+    state = np.where(mask, np.uint8(LETHAL), risk.state)
+    return Ground(spec, state, np.minimum(risk.clearance_m, distance_m), mask)
 
 
 def arc_lengths(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -22,7 +22,8 @@ class SafetyLimits(NamedTuple):
 class SafetyInputs(NamedTuple):
     """What the machine looks at: ages of inputs in seconds (None: never came), and the mission's phase.
 
-    in_the_way: somebody moves so near that the robot must stand (see `separation`).
+    in_the_way: somebody moves so near that the robot must stand (see `separation`). fences_missing: the mission has
+    fences that have not been heard of here.
     """
 
     risk_age_s: float | None
@@ -31,6 +32,7 @@ class SafetyInputs(NamedTuple):
     policy_silence_s: float
     phase: MissionPhase | None
     in_the_way: bool = False
+    fences_missing: bool = False
 
 
 class Verdict(NamedTuple):
@@ -50,6 +52,8 @@ def judge(limits: SafetyLimits, inputs: SafetyInputs) -> Verdict:
     asked = [*_stale(limits, inputs), *_mission(inputs.phase)]
     if inputs.in_the_way:
         asked.append((SafetyState.HOLD, "somebody moves in the way"))
+    if inputs.fences_missing:
+        asked.append((SafetyState.HOLD, "the mission's fences have not come yet"))
     if not asked:
         return Verdict(SafetyState.RUN, "", True, False)
     state, reason = max(asked, key=lambda entry: _SEVERITY.index(entry[0]))

@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.fences import FenceView
+from planning.frames import Planar
 from planning.grid import GridSpec
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp, Topic
@@ -16,6 +18,7 @@ from schemas.sensing import Odometry
 from schemas.snapshot import pack_message, pack_snapshot, unpack_message, unpack_snapshot
 from schemas.topics import (
     EPISODE,
+    FENCES,
     FOLLOWER,
     LOCAL_IRM,
     LOCAL_POLICY,
@@ -25,7 +28,7 @@ from schemas.topics import (
     PLAN,
     RISK_MAP,
 )
-from schemas.world import LocalIrm
+from schemas.world import LocalIrm, RiskMap
 from services.reconciler.config import Config
 from services.reconciler.episode import (
     Committed,
@@ -42,7 +45,7 @@ from services.reconciler.episode import (
     usable_nodes,
 )
 from services.reconciler.following import Driven
-from services.reconciler.path import STEP_M, Ground, headings, resample, speeds
+from services.reconciler.path import STEP_M, Ground, fenced_ground, headings, resample, speeds
 from services.reconciler.safety import SafetyInputs, SafetyLimits, Verdict, judge
 from services.reconciler.separation import Guard
 from services.reconciler.tau import choose_tau, tau_terms
@@ -63,7 +66,7 @@ _SOON_M = 2.5
 
 def spec(config: Config) -> StageSpec:
     """How to run the stage: at 10 Hz, and at once on risk maps, on what moves, and on answers."""
-    triggers = (RISK_MAP.name, MOVING.name, LOCAL_POLICY.name)
+    triggers = (RISK_MAP.name, MOVING.name, LOCAL_POLICY.name, FENCES.name)
     return StageSpec("reconciler", SECOND_NS // 10, triggers, latency_ns=SECOND_NS // 100)
 
 
@@ -80,6 +83,7 @@ class ReconcilerStage:
         self._seed = seed
         self._driven = Driven(config)
         self._guard = Guard(config)
+        self._fences = FenceView()
         self._opened: Opened | None = None
         self._episode = 0
         self._opened_ns = -(10**18)
@@ -106,19 +110,14 @@ class ReconcilerStage:
             self._asked_ns = -1
         if odometry is None or risk is None:
             return []
-        g = risk.message.grid
-        ground = Ground(
-            GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height),
-            risk.message.state,
-            risk.message.clearance_m,
-        )
+        ground, fences_changed = self._ground(inputs, risk.message, odometry.message)
         found: Outputs = []
         follower = inputs.current(FOLLOWER)
         if self._driven.follow(now, odometry.message, follower, self._plan_id, ground):
             self._opened = None
         for received in inputs.new(LOCAL_POLICY):
             self._install(now, received.message, odometry.message, ground)
-        if risk.fresh or self._driven.changed:
+        if risk.fresh or self._driven.changed or fences_changed:
             self._driven.check_hazards(ground)
             if self._driven.changed:  # another line: who is in its way?
                 self._guard.watch(now, points, self._driven.ahead(odometry.message))
@@ -129,6 +128,15 @@ class ReconcilerStage:
             found += self._open(now, irm, odometry.message, ground)
         found += self._publish(now, verdict, odometry.message, ground, risk.message.stamp_ns)
         return found
+
+    def _ground(self, inputs: Inputs, risk: RiskMap, odometry: Odometry) -> tuple[Ground, bool]:
+        """What may be driven on: the risk map within the fences. Whether the fences are others than before."""
+        told, frame, pose = inputs.latest(FENCES), odometry.map_to_odom, odometry.pose
+        changed = told is not None and self._fences.update(told.message.version, told.message.fences)
+        g = risk.grid
+        spec = GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
+        shut = self._fences.shut(spec, Planar(frame.x_m, frame.y_m, frame.yaw_rad))
+        return fenced_ground(risk, shut, (pose.x_m, pose.y_m)), changed
 
     # --- safety -----------------------------------------------------------------------------------------------
 
@@ -151,8 +159,14 @@ class ReconcilerStage:
                 waiting,
                 mission.phase if mission is not None else None,
                 self._guard.share <= 0.0,
+                mission is not None and mission.fences_version != self._fences_heard(inputs),
             ),
         )
+
+    def _fences_heard(self, inputs: Inputs) -> int:
+        """Version of the fences that hold here: of what was told now, else of before a restart; 0 without any."""
+        told = inputs.latest(FENCES)
+        return max(self._fences.version, 0) if told is None else told.message.version
 
     # --- episodes -----------------------------------------------------------------------------------------------
 
@@ -386,6 +400,7 @@ class ReconcilerStage:
                 **{name: getattr(self, f"_{name}") for name in _KEPT},
                 "driven": self._driven.state(),
                 "guard": self._guard.state(),
+                "fences": self._fences.state(),
                 "opened": None if self._opened is None else pack_opened(self._opened),
                 "plan": None if self._plan is None else pack_message(self._plan),
             }
@@ -398,6 +413,8 @@ class ReconcilerStage:
             setattr(self, f"_{name}", state[name])
         self._driven.load(state["driven"])
         self._guard.load(state["guard"])
+        if "fences" in state:  # older snapshots have none
+            self._fences.set_state(state["fences"])
         self._opened = None if state["opened"] is None else unpack_opened(state["opened"])
         self._plan = None if state["plan"] is None else unpack_message(state["plan"], Plan)
 

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Header, Path
 from pydantic import BaseModel, ConfigDict, Field
 
-from schemas.fences import Fences
 from schemas.operation import CommandAnswer, CommandKind
 from services.status.commands import CommandReport
-from services.status.geojson import FeatureCollectionOut, FenceRequest, fences_geojson
+from services.status.geojson import FeatureCollectionOut, FenceRequest
 from services.status.planners import mission_detail
 from services.status.problems import ProblemError
 from services.status.report import MissionDetail
@@ -25,7 +24,7 @@ Key = Annotated[
         min_length=1,
         max_length=64,
         pattern=r"^[A-Za-z0-9._:-]+$",
-        description="Of your choice, new for every command. Sent again, it gets the same answer: nothing is done twice.",
+        description="Of your choice, new for every command. A repeated one is answered alike, not carried out again.",
     ),
 ]
 FenceId = Annotated[str, Path(min_length=1, max_length=64, examples=["no_go-1"])]
@@ -109,8 +108,7 @@ def _fence_routes(api: APIRouter, shared: SharedStatus) -> None:
     @api.get("/fences", dependencies=viewer)
     def fences() -> FeatureCollectionOut:
         """Geofence, no-go and priority polygons, as GeoJSON in metres; each names its frame."""
-        held = shared.read(lambda core, now_ns: core.latest("mission/fences", Fences))
-        return fences_geojson(held.version if held else 0, held.fences if held else [])
+        return shared.fences()
 
     @api.post("/fences", dependencies=operator, responses=_SAYS)
     def add_fences(body: FenceRequest, key: Key = None) -> CommandReport:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from schemas.fences import MAX_FENCES, Fence
 from schemas.operation import CommandAnswer, CommandKind, MissionCommand
-from services.status.geojson import FenceRequest
+from services.status.geojson import FeatureCollectionOut, FenceRequest
 from services.status.problems import FieldError, ProblemError, field_name, problem_json
 
 Send = Callable[[MissionCommand], None]
@@ -159,9 +159,14 @@ class CommandBody(BaseModel):
         return desk.ask(self.kind, self.command_id, self.time_budget_s or 0.0, fences, self.fence_ids)
 
 
-def answer_json(desk: CommandDesk, payload: bytes) -> bytes:
-    """A command as JSON bytes in, the mission's answer, or a problem, as JSON bytes out: the Zenoh queryable."""
+def answer_json(desk: CommandDesk, payload: bytes, fences: Callable[[], FeatureCollectionOut]) -> bytes:
+    """A command as JSON bytes in, the mission's answer, or a problem, as JSON bytes out: the Zenoh queryable.
+
+    Nothing in: the fences that hold, as GeoJSON.
+    """
     try:
+        if not payload:
+            return fences().model_dump_json().encode()
         report = CommandReport.of(CommandBody.model_validate_json(payload).ask(desk))
         return report.model_dump_json().encode()
     except ValidationError as error:

@@ -10,11 +10,13 @@ from typing import Any, TypeVar
 from prometheus_client import CollectorRegistry, Gauge, generate_latest
 
 from schemas.base import Message
+from schemas.fences import Fences
 from schemas.operation import CommandAnswer
 from schemas.world import GraphRequest
 from services.status.commands import CommandDesk
 from services.status.config import Config
 from services.status.core import StatusCore
+from services.status.geojson import FeatureCollectionOut, fences_geojson
 from services.status.picture import render_png
 from services.status.report import StatusReport
 
@@ -46,6 +48,11 @@ class SharedStatus:
         """What `work(core, now_ns)` gives, with the core locked meanwhile: take out what is needed and be quick."""
         with self._lock:
             return work(self._core, self._now_ns())
+
+    def fences(self) -> FeatureCollectionOut:
+        """The fences that hold, as GeoJSON."""
+        held = self.read(lambda core, now_ns: core.latest("mission/fences", Fences))
+        return fences_geojson(held.version if held else 0, held.fences if held else [])
 
     def graph_request(self, stamp_ns: int) -> GraphRequest | None:
         """See `StatusCore.graph_request`."""
