@@ -17,7 +17,9 @@ CHROMIUM = os.environ.get("PLGRIM_CHROMIUM") or shutil.which("chromium") or shut
 @contextmanager
 def chromium() -> Iterator[Any]:
     """A browser, of Playwright's synchronous interface."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: extra `page`")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed: extra `page`"
+    )
     if CHROMIUM is None:
         pytest.skip("no Chromium: install the system's package, or name one with PLGRIM_CHROMIUM")
     with playwright.sync_playwright() as p:

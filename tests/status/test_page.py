@@ -75,9 +75,7 @@ class Robot:
         ]
         phase = PHASES.get(command.kind, MissionPhase.EXPLORE)
         self.scene.phase = phase
-        self.shared.observe(
-            "mission/fences", Fences(stamp_ns=1, version=len(self.asked), fences=self.fences)
-        )
+        self.shared.observe("mission/fences", Fences(stamp_ns=1, version=len(self.asked), fences=self.fences))
         self.shared.observe("mission/state", mission(self.scene.n, phase))
         answer = CommandAnswer(
             stamp_ns=1, command_id=command.command_id, kind=command.kind, accepted=True,
