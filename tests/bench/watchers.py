@@ -1,19 +1,19 @@
-"""What watching costs the planners: `python -m tests.bench.watchers --url http://127.0.0.1:8080`, with a mission that runs.
+"""What watching costs the planners: `python -m tests.bench.watchers --url URL`, beside a mission on this host.
 
-Rounds of two windows, in turn without and with watchers (20 clients that poll the status once a second, 5 WebSockets of
-the live page that acknowledge at once). At the end of each window the median step time of every planner is read from its
-health, which is over its newest steps: a window must be longer than those. Printed: for each planner the ratio with over
-without, median and range of the rounds. Exit 1 when a planner's median ratio is over 1.05.
+Rounds of two windows, in turn without and with watchers: 20 clients that poll the status each second, and 5 WebSockets
+of the live page that acknowledge at once. A planner's step time in a window is the time that its process ran or waited
+for a core (Linux, /proc/PID/task/*/schedstat), over the steps that it made. Printed: for each planner the ratio with
+over without, median and range of the rounds. Exit 1 when a planner's median ratio is over 1.05.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import contextlib
 import json
 import statistics
 import sys
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -41,35 +41,47 @@ async def watch(url: str, frames: list[int]) -> None:
             await socket.send(json.dumps({"version": version}))
 
 
-async def step_ms(client: httpx.AsyncClient, url: str) -> dict[str, float]:
-    """Median step time of each planner now, ms."""
+def busy_ms(pid: int) -> float:
+    """Time that a process' threads have run or waited for a core, ms."""
+    total = 0
+    for stat in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        ran, waited, _ = stat.read_text(encoding="ascii").split()
+        total += int(ran) + int(waited)
+    return total / 1e6
+
+
+async def counts(client: httpx.AsyncClient, url: str) -> dict[str, tuple[float, int]]:
+    """Busy ms and steps so far, of each planner."""
     report: dict[str, Any] = (await client.get(f"{url}/api/v1/status")).json()
-    return {s["service"]: s["step_p50_ms"] for s in report["stages"] if s["service"] in PLANNERS}
+    known = [stage for stage in report["stages"] if stage["service"] in PLANNERS and stage["pid"]]
+    return {stage["service"]: (busy_ms(stage["pid"]), stage["steps"]) for stage in known}
 
 
 async def window(
     client: httpx.AsyncClient, url: str, args: argparse.Namespace, watched: bool
 ) -> dict[str, float]:
-    """Step times at the end of one window."""
+    """Mean step time of each planner in one window, ms."""
     frames = [0]
     watchers = [poll(client, url, args.every_s) for _ in range(args.clients)] if watched else []
     watchers += [watch(url, frames) for _ in range(args.sockets)] if watched else []
     tasks = [asyncio.create_task(one) for one in watchers]
+    await asyncio.sleep(2.0)
+    before = await counts(client, url)
     await asyncio.sleep(args.window_s)
+    after = await counts(client, url)
     gone = [task for task in tasks if task.done()]
     for task in tasks:
         task.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await asyncio.gather(*tasks, return_exceptions=True)
+    await asyncio.gather(*tasks, return_exceptions=True)
     if gone:
         raise RuntimeError(f"{len(gone)} watchers ended by themselves: {gone[0].exception()}")
-    found = await step_ms(client, url)
     if watched:
         print(
-            f"  {frames[0] / args.window_s / max(args.sockets, 1):.1f} frames a second to each page",
+            f"  {frames[0] / (args.window_s + 2) / max(args.sockets, 1):.1f} frames a second to each page",
             flush=True,
         )
-    return found
+    made = {name: after[name][1] - before[name][1] for name in before if name in after}
+    return {name: (after[name][0] - before[name][0]) / steps for name, steps in made.items() if steps > 0}
 
 
 async def run(args: argparse.Namespace) -> int:
@@ -82,7 +94,7 @@ async def run(args: argparse.Namespace) -> int:
             order = (False, True) if number % 2 == 0 else (True, False)
             found = {watched: await window(client, args.url, args, watched) for watched in order}
             for name, without in found[False].items():
-                if without > 0:
+                if without > 0 and name in found[True]:
                     ratios[name].append(found[True][name] / without)
     worst = 0.0
     for name, values in ratios.items():
