@@ -1,0 +1,52 @@
+"""Whole missions in lock-step: fences drawn on the way are obeyed by the true robot, bound it, can be taken away."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from schemas.fences import FenceKind
+from schemas.operation import CommandKind, FinishReason, MissionCommand
+from tests.fences.scene import box, command, fence, mission
+
+EAST = (8.0, -1.0, 16.0, 9.0)
+"""All of the east room with half of its door."""
+
+
+def draw(name: str, kind: FenceKind, *corners: float) -> MissionCommand:
+    return command(name, CommandKind.FENCE, fences=[fence(kind, box(*corners))])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_no_go_polygon_drawn_on_the_way_is_never_entered(tmp_path: Path) -> None:
+    run = mission(tmp_path, {4.0: draw("a", FenceKind.NO_GO, *EAST)})
+    end = run.to_its_end()
+    assert [answer.accepted for answer in run.seen.answers] == [True]
+    assert run.seen.inside(*EAST, since_s=4.0) == 0
+    assert end.finish == FinishReason.COVERED
+    assert run.seen.inside(0.5, 8.5, 7.5, 13.5) > 0  # the north room was explored
+    assert any("fence" in place.reason for place in end.left)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_geofence_bounds_a_mission_that_still_ends_covered(tmp_path: Path) -> None:
+    run = mission(tmp_path, {0.5: draw("a", FenceKind.GEOFENCE, -1.0, -1.0, 8.0, 8.0)})
+    end = run.to_its_end()
+    assert end.finish == FinishReason.COVERED
+    assert all(-1.0 < x < 8.0 and -1.0 < y < 8.0 for _, x, y in run.seen.track)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_ground_behind_a_fence_that_is_removed_is_explored(tmp_path: Path) -> None:
+    script = {0.5: draw("a", FenceKind.NO_GO, *EAST), 45.0: command("b", CommandKind.UNFENCE)}
+    run = mission(tmp_path, script)
+    run.until(lambda seen: len(seen.answers) == 2, 60.0)
+    assert run.seen.inside(*EAST) == 0
+    end = run.to_its_end()
+    assert end.finish == FinishReason.COVERED
+    assert run.seen.inside(*EAST) > 0
+    assert run.seen.coverage > 0.95
