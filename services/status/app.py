@@ -5,26 +5,31 @@ The page at `/` and all answers need nothing from elsewhere; only `/docs` loads 
 
 from __future__ import annotations
 
+import math
 import socket
 import threading
+import time
 from typing import Literal
 
 import uvicorn
 from fastapi import Depends, FastAPI, Response
-from fastapi.responses import HTMLResponse
 from prometheus_client import CONTENT_TYPE_LATEST
 from pydantic import BaseModel
 
 from services.status.api_mission import mission_routes
 from services.status.api_views import NO_STORE, view_routes
-from services.status.page import PAGE
+from services.status.board import Board
+from services.status.live import Painter
+from services.status.live_socket import add_live
+from services.status.page import add_page
 from services.status.problems import FiniteJSONResponse, install
 from services.status.report import Readiness
-from services.status.security import check_binding, require_viewer, secure
+from services.status.security import check_binding, require_viewer, require_viewer_socket, secure
 from services.status.shared import SharedStatus
 
 __all__ = ["PortTakenError", "SharedStatus", "StatusServer", "create_app"]
 
+_SLOW_S = 0.5
 _DESCRIPTION = """What the robot does and why, and how to steer it.
 
 Lengths are in metres, angles in radians, times in seconds of mission time, places in the frame `map` unless a field
@@ -42,6 +47,29 @@ _TAGS = [
     {"name": "events", "description": "What happened, and why."},
     {"name": "access", "description": "Tokens."},
 ]
+
+
+class LiveStatus:
+    """Draws the shared status onto a board for the live page. What changes slowly at most every `_SLOW_S`."""
+
+    def __init__(self, shared: SharedStatus) -> None:
+        self._shared = shared
+        self._painter = Painter()
+        self._told_s = -math.inf
+        self.tick()  # its kernel is compiled before anybody looks
+        self._told_s = -math.inf
+
+    @property
+    def board(self) -> Board:
+        """What browsers are sent."""
+        return self._painter.board
+
+    def tick(self) -> None:
+        """Draw what has changed."""
+        now_s, since = time.monotonic(), self._painter.pastes
+        due = now_s - self._told_s >= _SLOW_S
+        self._told_s = now_s if due else self._told_s
+        self._painter.paint(self._shared.read(lambda core, now_ns: core.view(now_ns, since, due)))
 
 
 def create_app(shared: SharedStatus) -> FastAPI:
@@ -76,11 +104,8 @@ def create_app(shared: SharedStatus) -> FastAPI:
         """For Prometheus."""
         return Response(shared.metrics(), media_type=CONTENT_TYPE_LATEST)
 
-    @app.get("/", response_class=HTMLResponse, include_in_schema=False)
-    def page() -> str:
-        """A plain page: the map and the status, renewed each second."""
-        return PAGE
-
+    add_live(app, LiveStatus(shared), [Depends(require_viewer_socket)])
+    add_page(app)
     return app
 
 
@@ -124,7 +149,9 @@ class StatusServer:
         settings = uvicorn.Config(
             create_app(shared),
             log_level="warning",
-            ws="none",
+            ws="websockets-sansio",
+            ws_per_message_deflate=False,
+            ws_max_size=4096,
             lifespan="off",
             server_header=False,
             limit_concurrency=shared.config.max_connections,

@@ -24,6 +24,8 @@ class TileCanvas:
     def __init__(self) -> None:
         self.resolution_m = 0.0
         self._tiles: dict[tuple[int, int], Cells] = {}
+        self._pastes = 0
+        self._pasted: dict[tuple[int, int], int] = {}
 
     def paste(self, spec: GridSpec, cells: NDArray[Any]) -> None:
         """Lay a window (height, width) over the canvas; its unknown cells leave what was known.
@@ -33,6 +35,7 @@ class TileCanvas:
         if spec.resolution_m != self.resolution_m:
             self.resolution_m = spec.resolution_m
             self._tiles.clear()
+            self._pasted.clear()
         for ty in range(spec.iy0 // TILE, (spec.iy0 + spec.height - 1) // TILE + 1):
             for tx in range(spec.ix0 // TILE, (spec.ix0 + spec.width - 1) // TILE + 1):
                 self._paste_tile(tx, ty, spec, cells)
@@ -45,7 +48,24 @@ class TileCanvas:
             return
         tile = self._tiles.setdefault((tx, ty), np.zeros((TILE, TILE), np.uint8))
         inside = tile[y0 - ty * TILE : y1 - ty * TILE, x0 - tx * TILE : x1 - tx * TILE]
-        np.copyto(inside, part.astype(np.uint8), where=part != 0)
+        part = part.astype(np.uint8)
+        fresh = (part != 0) & (part != inside)
+        if fresh.any():
+            inside[fresh] = part[fresh]
+            self._touch((tx, ty))
+
+    def _touch(self, tile: tuple[int, int]) -> None:
+        self._pastes += 1
+        self._pasted[tile] = self._pastes
+
+    def changed(self, since: int) -> tuple[int, dict[tuple[int, int], Cells]]:
+        """Copies of the tiles that changed after `since` (0: all), and the number to ask with the next time."""
+        tiles = {tile: self._tiles[tile].copy() for tile, paste in self._pasted.items() if paste > since}
+        return self._pastes, tiles
+
+    def tiles(self) -> set[tuple[int, int]]:
+        """The tiles that hold something, by (x, y) in tiles."""
+        return set(self._tiles)
 
     def state(self) -> dict[str, Any]:
         """For a snapshot."""
@@ -56,6 +76,9 @@ class TileCanvas:
         """From a snapshot."""
         self.resolution_m = state["resolution_m"]
         self._tiles = {(tx, ty): tile for tx, ty, tile in state["tiles"]}
+        self._pasted.clear()
+        for tile in self._tiles:
+            self._touch(tile)
 
     def whole(self) -> tuple[GridSpec, Cells] | None:
         """Everything known, cut to its bounding box; None when nothing is."""

@@ -14,16 +14,18 @@ from planning.graph_mirror import FRONTIER, GraphMirror, RoadMap
 from planning.grid import GridSpec
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS
+from schemas.fences import Fences
 from schemas.operation import JudgeReport, LinkReport, MissionState, StageHealth
 from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import health_topic, topic_named
-from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest
+from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest, LocalIrm, RiskMap
 from services.status.canvas import TileCanvas
 from services.status.config import Config
 from services.status.events import EventLog
 from services.status.history import Curve, CurvePoint
+from services.status.memory import LiveMemory
 from services.status.picture import Picture
 from services.status.report import (
     CoverageReport,
@@ -35,6 +37,7 @@ from services.status.report import (
     TargetReport,
     TopicReport,
 )
+from services.status.view import SlowView, View
 
 _RATE_SMOOTHING = 0.2
 _M = TypeVar("_M", bound=Message)
@@ -62,6 +65,7 @@ class StatusCore:
         self.target_switches = 0
         self.events = EventLog()
         self.curve = Curve()
+        self.memory = LiveMemory()
         self._seen: dict[str, _Seen] = {}
         self._trajectory: list[tuple[float, float]] = []
         self._mirror = GraphMirror()
@@ -72,6 +76,7 @@ class StatusCore:
         """Take in one message. now_ns: local monotonic clock, the same one that the other calls are given."""
         self._note(topic_name, message, now_ns)
         self.events.observe(message)
+        self.memory.observe(message)
         if isinstance(message, Odometry):
             self._follow(message)
         elif isinstance(message, CoverageWindow):
@@ -290,6 +295,42 @@ class StatusCore:
             title=self._title(),
         )
 
+    def view(self, now_ns: int, tiles_since: int, with_report: bool) -> View:
+        """What the live page shows, to be drawn outside the lock: nothing in it changes any more.
+
+        tiles_since: tiles of the canvas that changed after this number are copied. with_report: tell what is told
+        more slowly, too.
+        """
+        place, (pastes, tiles) = self._pose(), self.canvas.changed(tiles_since)
+        return View(
+            odometry=self.latest("sim/odometry", Odometry),
+            place=None if place is None else (place.x_m, place.y_m, place.yaw_rad),
+            risk=self.latest("riskmap/risk_map", RiskMap),
+            local=self.latest("irm/local_irm", LocalIrm),
+            policy=self.latest("gcp/global_policy", GlobalPolicy),
+            plan=self.latest("reconciler/plan", Plan),
+            fences=self.latest("mission/fences", Fences),
+            old_path=self.memory.old_path,
+            graph=self._mirror.road_map(),
+            pastes=pastes,
+            tiles=tiles,
+            tile_names=self.canvas.tiles(),
+            resolution_m=self.canvas.resolution_m,
+            trajectory=self._trajectory.copy(),
+            slow=self._slow(now_ns) if with_report else None,
+        )
+
+    def _slow(self, now_ns: int) -> SlowView:
+        state = self.latest("mission/state", MissionState)
+        return SlowView(
+            report=self.status(now_ns),
+            began_s=None if state is None else state.stamp_ns / SECOND_NS - state.elapsed_s,
+            restarts=dict(self.memory.restarts),
+            curve=tuple(self.curve.points),
+            step_times=self.memory.step_times.rows(),
+            events=tuple(self.events.events),
+        )
+
     def _plan_in_map(self) -> tuple[tuple[float, float], ...]:
         plan, odometry = self._latest("reconciler/plan", Plan), self._latest("sim/odometry", Odometry)
         if plan is None or odometry is None or not plan.valid:
@@ -313,6 +354,7 @@ class StatusCore:
                 "events": self.events.state(),
                 "curve": [list(point) for point in self.curve.points],
                 "curve_spacing_s": self.curve.spacing_s,
+                "memory": self.memory.state(),
             }
         )
 
@@ -326,6 +368,8 @@ class StatusCore:
             self.events.set_state(state["events"])
             self.curve.points = [CurvePoint(*point) for point in state["curve"]]
             self.curve.spacing_s = state["curve_spacing_s"]
+        if "memory" in state:
+            self.memory.set_state(state["memory"])
 
     def numbers(self, now_ns: int) -> Mapping[str, float]:
         """The numbers of the status by name, for metrics; only what is known."""
