@@ -35,7 +35,11 @@ def test_writers_and_readers_are_services() -> None:
 
 
 def test_who_writes_the_mission_and_the_motion() -> None:
-    assert [topic.name for topic in written_by("mission")][-3:] == ["mission/fences", "mission/state", "mission/answer"]
+    assert [topic.name for topic in written_by("mission")][-3:] == [
+        "mission/fences",
+        "mission/state",
+        "mission/answer",
+    ]
     assert {topic.writer for topic in TOPICS if topic.message.schema_name == "plan"} == {"reconciler"}
 
 
