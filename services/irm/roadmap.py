@@ -125,7 +125,7 @@ class Roadmap:
         keys: list[tuple[int, int]] = []
         lines: list[tuple[tuple[float, float], tuple[float, float]]] = []
         for a, b, edge in self.graph.edges(data=True):
-            low, high = min(a, b), max(a, b)
+            low, high = edge_key(a, b)
             if low == ROBOT or (low, high) in self.clear:
                 continue
             ends = self.road.place(low), self.road.place(high)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, settings
@@ -40,7 +42,7 @@ schema = schemathesis.openapi.from_asgi("/openapi.json", _application(), headers
     phases=(Phase.explicit, Phase.generate),
     suppress_health_check=list(HealthCheck),
 )
-def test_every_answer_is_in_the_document(case: Case) -> None:
+def test_every_answer_is_in_the_document(case: Case[Any]) -> None:
     # Whether a ring is closed and does not cross itself is more than a JSON schema can say: 422 is right for it.
     checks = [schemathesis.checks.positive_data_acceptance]
     case.call_and_validate(headers=_HEADERS, excluded_checks=checks)
