@@ -11,7 +11,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "plgrim explore --map my_building.yaml --start 2.5 -1.0 --time-budget 600",
     ),
     "up": ("plgrim up --config robot.yaml --keep",),
-    "resume": ("plgrim resume --out out/up",),
+    "recover": ("plgrim recover out/up",),
     "watch": ("plgrim watch --out out/mission",),
     "run": ("plgrim run gcp --config robot.yaml",),
     "router": ("plgrim router --listen tcp/127.0.0.1:7457",),

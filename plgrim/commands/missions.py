@@ -1,4 +1,4 @@
-"""`plgrim demo`, `explore`, `up`, `resume`, `watch`: whole missions."""
+"""`plgrim demo`, `explore`, `up`, `recover`, `watch`: whole missions."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def up(
     _live(config, out, until_end=until_end, services=services, hold_failed_s=0.0)
 
 
-def resume(
+def recover(
     folder: Annotated[Path, typer.Argument(help="Result folder of a run that was cut off.")],
     keep: Annotated[bool, typer.Option("--keep", help="Go on after the mission's end.")] = False,
 ) -> None:
@@ -214,5 +214,5 @@ def _finish(result: dict[str, Any], out: Path) -> None:
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    for command in (demo, explore, up, resume, watch):
+    for command in (demo, explore, up, recover, watch):
         app.command()(command)

@@ -34,10 +34,12 @@ def ask_mission(body: dict[str, Any] | None, config_file: Path | None) -> dict[s
     from plgrim.errors import CommandRefusedError, ConfigError, NoAnswerError
     from plgrim.runtime.status_service import command_key
     from plgrim.runtime.zenoh_session import connect
+    from plgrim.security.access import OPERATOR
 
     config = load_config(config_file)
     payload = b"" if body is None else json.dumps(body).encode()
-    with connect(config.router, config.robot, threading.Event(), config.runtime.router_timeout_s) as link:
+    timeout_s = config.runtime.router_timeout_s
+    with connect(config.router, config.robot, threading.Event(), timeout_s, OPERATOR) as link:
         reply = link.ask(command_key(config.robot), _TIMEOUT_S, payload)
     if reply is None:
         raise NoAnswerError(

@@ -11,8 +11,8 @@ from plgrim.doctor import machine
 from plgrim.doctor.certificates import certificates
 from plgrim.doctor.finding import Finding
 from plgrim.doctor.system import system
+from plgrim.hosts import host_and_port
 from plgrim.missions import status_address, status_page
-from plgrim.runtime.router import host_and_port
 
 
 def examine(config: Config, listen_s: float) -> list[Finding]:

@@ -88,7 +88,7 @@ def _read_clock(path: Path) -> dict[str, Any]:
 
 
 class ClockFile:
-    """Writes the mission clock down once a second, for a resume after a reboot."""
+    """Writes the mission clock down once a second, for `plgrim recover` after a reboot."""
 
     def __init__(self, state: Path) -> None:
         self._path = state / _CLOCK

@@ -13,6 +13,7 @@ from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.mailbox import Mailbox, Outbox
 from plgrim.runtime.router import page_address
 from plgrim.runtime.service import LiveService
+from plgrim.security.access import COMMAND_QUERY, root_of
 from schemas.base import Message
 from schemas.contract import Output, Topic
 from schemas.topics import COMMAND, STATUS_GRAPH_REQUEST, read_by
@@ -26,7 +27,7 @@ _TICK_S = 0.2
 
 def command_key(robot: str) -> str:
     """Where commands are asked for over Zenoh: a query with the command as JSON, answered with the mission's answer."""
-    return f"plgrim/@v1/{robot}/mission/command"
+    return f"{root_of(robot)}/{COMMAND_QUERY}"
 
 
 class StatusFeed:

@@ -43,7 +43,7 @@ from schemas.codec import decode
 from schemas.contract import Topic
 from schemas.errors import MessageError
 from schemas.operation import StageHealth
-from schemas.topics import SERVICES, health_topic
+from schemas.topics import SERVICES, SUPERVISOR, health_topic
 
 __all__ = ["ROUTER", "Child", "Command", "Supervisor", "plgrim_command", "with_fresh_state"]
 
@@ -100,7 +100,9 @@ class Supervisor:
         write_config(self.config, self._folder / "config.yaml")
         self._spawn(self.children[ROUTER])
         try:
-            self.link = connect(self.config.router, self.config.robot, threading.Event(), 15.0)
+            self.link = connect(
+                self.config.router, self.config.robot, threading.Event(), 15.0, SUPERVISOR.writer
+            )
         except PlgrimError:
             self._check_fatal(self.children[ROUTER])
             raise

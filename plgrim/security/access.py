@@ -12,10 +12,15 @@ from typing import Any
 
 from schemas.base import Message
 from schemas.contract import Topic
-from schemas.topics import LINK, SERVICES, TOPICS, health_topic
+from schemas.topics import LINK, SERVICES, TOPICS, health_topic, recorder_topics
 
 TOOLS = "tools"
-"""The name under which `plgrim watch`, `healthcheck`, `record` and the supervisor read along; they write nothing."""
+"""The name under which `plgrim watch`, `healthcheck`, `record` and the supervisor read along. They
+write no topic; a recorder hands out its segments."""
+OPERATOR = "operator"
+"""The name under which `plgrim pause`, `home`, `geofence` and their like steer the mission."""
+COMMAND_QUERY = "mission/command"
+"""What they ask; the status service answers it, after the mission has."""
 ROUTER = "router"
 
 
@@ -40,8 +45,9 @@ class Grant:
 
 
 def every_topic() -> list[Topic[Message]]:
-    """All topics, health included."""
-    return [*TOPICS, *(health_topic(service) for service in (*SERVICES, LINK))]
+    """All topics, those of the drivers (health, steps, snapshots) included."""
+    told = (topic for service in SERVICES for topic in recorder_topics(service))
+    return [*TOPICS, *(health_topic(service) for service in (*SERVICES, LINK)), *told]
 
 
 def writers() -> tuple[str, ...]:
@@ -58,10 +64,11 @@ def service_grant(service: str, robot: str, instance: str = "") -> Grant:
     """What the table of topics lets a service do. instance: `base` or `standby` of a service that has two."""
     own = f"{root_of(robot)}/{instance}/{service}" if instance else f"{root_of(robot)}/{service}"
     topics = every_topic()
+    commands = (f"{root_of(robot)}/{COMMAND_QUERY}",) if service == "status" else ()
     return Grant(
         puts=tuple(f"{own}/{topic.name.partition('/')[2]}" for topic in topics if topic.writer == service),
         reads=tuple(topic.key(robot) for topic in topics if service in topic.readers),
-        answers=(f"{own}/health_now",),
+        answers=(f"{own}/health_now", f"{own}/snapshot_now", *commands),
         asks=(f"{own}/health_now",),
         declares=(f"{own}/alive/*",),
         watches=(f"{own}/alive/*",),
@@ -71,7 +78,14 @@ def service_grant(service: str, robot: str, instance: str = "") -> Grant:
 def tools_grant(robot: str) -> Grant:
     """Of those who look on: they read everything and write nothing."""
     root = root_of(robot)
-    return Grant(reads=(f"{root}/**",), asks=(f"{root}/**/health_now",), watches=(f"{root}/**",))
+    asked = tuple(f"{root}/**/{query}" for query in ("health_now", "snapshot_now"))
+    segments = f"{root}/record/segments"
+    return Grant(reads=(f"{root}/**",), answers=(segments,), asks=(*asked, segments), watches=(f"{root}/**",))
+
+
+def operator_grant(robot: str) -> Grant:
+    """Of who steers the mission from the command line: reads along, and asks the mission."""
+    return tools_grant(robot) | Grant(asks=(f"{root_of(robot)}/{COMMAND_QUERY}",))
 
 
 def certificate_name(process: str, role: str, robot: str) -> str:

@@ -10,12 +10,14 @@ from plgrim.hosts import SECURE, protocol
 from plgrim.link.config import LinkConfig
 from plgrim.link.routes import down, keys_written, leased_outputs, up_plain
 from plgrim.security.access import (
+    OPERATOR,
     ROUTER,
     TOOLS,
     Grant,
     access_control,
     certificate_name,
     everything_grant,
+    operator_grant,
     service_grant,
     tools_grant,
 )
@@ -66,6 +68,8 @@ def grant_of(process: str, config: Config) -> Grant:
     robot, role = config.robot, role_of(config)
     if process == TOOLS:
         return tools_grant(robot)
+    if process == OPERATOR:
+        return operator_grant(robot)
     if process == LINK:
         return link_grant(config.link, robot, role)
     own = service_grant(process, robot, config.link.instance(process))

@@ -1,4 +1,4 @@
-"""Everything dies in the middle of a mission, the supervisor first; `plgrim resume` goes on with all acknowledged."""
+"""Everything dies in the middle of a mission, the supervisor first; `plgrim recover` goes on with all acknowledged."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_all_killed_in_mid_mission(
         assert gone[1] == [], "orphans"
         before = observer.graph_size()
         began = time.monotonic()
-        processes.append(_start(["resume", str(out)], out, _reboot(tmp_path) if reboot else ()))
+        processes.append(_start(["recover", str(out)], out, _reboot(tmp_path) if reboot else ()))
 
         def drives() -> list[float]:
             said = ear.since(PLAN, began)

@@ -17,12 +17,12 @@ from plgrim.deployment import ROLES, Role
 from plgrim.errors import NoRouterError
 from plgrim.runtime.router import router_settings
 from plgrim.runtime.zenoh_session import Link, connect
-from plgrim.security.access import TOOLS, every_topic, root_of
+from plgrim.security.access import OPERATOR, TOOLS, every_topic, root_of
 from plgrim.security.certificates import Authority
 from plgrim.security.policy import clients_of, router_grants
 from schemas.base import Message
 from schemas.contract import Topic
-from schemas.topics import INSTANCES, LINK, health_topic
+from schemas.topics import INSTANCES, LINK, SUPERVISOR, health_topic
 from schemas.world import GraphRequest
 from tests.runtime.helpers import eventually
 from tests.security.conftest import ROBOT
@@ -33,6 +33,8 @@ Heard = list[tuple[str, bytes]]
 
 AT_BASE = ("gcp", "status")
 """The usual split, of which gcp has a standby on the robot."""
+QUIET = (TOOLS, OPERATOR)
+"""They write no topic."""
 INSTANCE: dict[Role, str] = {"all": "", "robot": "standby", "base": "base"}
 
 
@@ -70,6 +72,8 @@ class Host:
 
     def health_key(self, process: str) -> str:
         """A key that a process may write here."""
+        if process == SUPERVISOR.writer:
+            return SUPERVISOR.key(ROBOT)
         instance = INSTANCE[self.role] if process == "gcp" else ""
         name = "gcp" if process == LINK and self.role != "all" else process
         return health_topic("riskmap" if process == LINK and self.role == "base" else name).key(
@@ -79,7 +83,7 @@ class Host:
     def last_words(self) -> None:
         """Wait until all that was put before is through: from each session, in order."""
         for process in self.links:
-            if process != TOOLS:
+            if process not in QUIET:
                 word = f"last word of {process}".encode()
                 key = self.health_key(process)
                 self.links[process].session.put(key, word)
@@ -98,7 +102,7 @@ def host(role: Role, certificates: Path) -> Iterator[Host]:
         made = Host(role, config, links, [])
         # A session of its own: what a session says itself, it hears without any router.
         _listen(stack.enter_context(joined(config, TOOLS)), f"{root_of(ROBOT)}/**", made.heard)
-        first = next(process for process in links if process != TOOLS)
+        first = next(process for process in links if process not in QUIET)
         eventually(lambda: made.heard, "heard", lambda: links[first].session.put(made.health_key(first), b""))
         yield made
 
@@ -152,7 +156,7 @@ def test_exactly_the_puts_that_the_table_allows_go_through(
         for process, link in here.links.items():
             for key, (topic, instance) in keys().items():
                 payload = f"{process} {key}".encode()
-                if process != TOOLS and may_put(role, process, topic, instance):
+                if process not in QUIET and may_put(role, process, topic, instance):
                     allowed.add((key, payload))
                 else:
                     refused += 1
@@ -167,7 +171,7 @@ def test_exactly_the_puts_that_the_table_allows_go_through(
 
 def test_every_process_reads_what_the_table_gives_it_and_nothing_else(everything: Host) -> None:
     links = everything.links
-    ears: dict[str, Heard] = {process: [] for process in links if process != TOOLS}
+    ears: dict[str, Heard] = {process: [] for process in links if process not in QUIET}
     for process, into in ears.items():
         for expression in ("**", f"{root_of(ROBOT)}/**", *(topic.key(ROBOT) for topic in every_topic())):
             _listen(links[process], expression, into)
