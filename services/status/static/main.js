@@ -199,3 +199,10 @@ function Page() {
 }
 
 render(html`<${Page} />`, Object.assign(document.getElementById("app"), { textContent: "" }));
+
+// The address that `plgrim demo` prints ends in #token=...: it becomes a session, and is gone from the address bar.
+const given = /^#token=(.+)$/.exec(location.hash)?.[1];
+if (given) {
+  history.replaceState(null, "", location.pathname + location.search);
+  if ((await api.openSession(decodeURIComponent(given))).ok) app.link.reconnect();
+}
