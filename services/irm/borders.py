@@ -44,58 +44,74 @@ def find_frontiers(window: Window, config: Config, least: float | None = None) -
     closure moved its patches.
     """
     s = window.spec
-    labels = np.zeros(s.shape, np.int32)
+    least = config.frontier_min_gain if least is None else least
     if config.coverage == "known":
-        return _find_behind(window, config, labels, config.frontier_min_gain if least is None else least)
+        return _find_behind(window, config, least)
     openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
     openings &= near_robot(window, config.opening_range_m)
     open_ground = (window.uncovered & (window.state == FREE)) | openings
-    pieces = label_components(open_ground, labels)
-    if pieces == 0:
-        return []
-    block = np.full(s.shape, -1, np.int32)
-    cells = max(1, round(config.frontier_block_m / s.resolution_m))
-    covered = window.ground & ~open_ground
-    blocks = mark_borders(open_ground, covered, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block)
-    if blocks == 0:
-        return []
-    reach = round(config.frontier_reach_m / s.resolution_m)
-    spread_blocks(open_ground, block, reach, blocks)
     behind = np.zeros(s.shape, np.int32)
     sizes = component_centroids(behind, label_components(window.hopeful, behind))[0]
-    gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
-    block_gains(window.entropy, behind, sizes, block, gain, sums, hidden)
+    blocks = _blocks_of(window, config, open_ground, window.ground & ~open_ground, behind, sizes)
+    if blocks is None:
+        return []
+    gain, hidden = blocks.gain, blocks.hidden
     hidden *= s.resolution_m**2
     gain += np.minimum(hidden * LOG_2 / config.spacing_m**2, config.unknown_max_gain)
-    places = block_places(window.reachable, block, sums, round(1.0 / s.resolution_m))
-    piece_of = np.zeros(blocks, np.int64)
-    inside = block >= 0
-    piece_of[block[inside]] = labels[inside]
-    least = config.frontier_min_gain if least is None else least
     opening = hidden >= config.opening_min_m2 - 1e-9
     # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
     gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
-    return _select(gain, opening, places, piece_of, window, least)
+    return _select(gain, opening, blocks.places, blocks.piece_of, window, least)
 
 
-def _find_behind(window: Window, config: Config, labels: NDArray[np.int32], least: float) -> list[Found]:
+def _find_behind(window: Window, config: Config, least: float) -> list[Found]:
     """The frontiers of `coverage: known`: blocks of the unknown behind the border, each with its expected gain."""
-    s, wanted = window.spec, window.uncovered
-    pieces = label_components(wanted, labels)
-    block = np.full(s.shape, -1, np.int32)
+    nothing = np.zeros(window.spec.shape, np.int32)
+    blocks = _blocks_of(window, config, window.uncovered, window.reachable, nothing, np.zeros(0, np.int64))
+    if blocks is None:
+        return []
+    openings = np.zeros(len(blocks.gain), np.bool_)
+    return _select(blocks.gain, openings, blocks.places, blocks.piece_of, window, least)
+
+
+class _Blocks(NamedTuple):
+    """Blocks of a border: gain of the ground that counts for each, nats, hidden: the cells that may lie behind it,
+    (b,) each; places: (b, 2) cells; piece_of: (b,), the connected piece it belongs to."""
+
+    gain: NDArray[np.float64]
+    hidden: NDArray[np.float64]
+    places: NDArray[np.int64]
+    piece_of: NDArray[np.int64]
+
+
+def _blocks_of(
+    window: Window,
+    config: Config,
+    open_ground: NDArray[np.bool_],
+    beside_it: NDArray[np.bool_],
+    behind: NDArray[np.int32],
+    sizes: NDArray[np.int64],
+) -> _Blocks | None:
+    """The border of the pieces of open ground with what lies beside it, in blocks; None when there is none.
+
+    behind, sizes: labels of the pieces of unseen ground, and their cells.
+    """
+    s = window.spec
+    labels, block = np.zeros(s.shape, np.int32), np.full(s.shape, -1, np.int32)
+    pieces = label_components(open_ground, labels)
     cells = max(1, round(config.frontier_block_m / s.resolution_m))
     blocks = mark_borders(
-        wanted, window.reachable, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block
+        open_ground, beside_it, labels, s.ix0, s.iy0, cells, pieces, window.robot_cell, block
     )
     if blocks == 0:
-        return []
-    spread_blocks(wanted, block, round(config.frontier_reach_m / s.resolution_m), blocks)
+        return None
+    spread_blocks(open_ground, block, round(config.frontier_reach_m / s.resolution_m), blocks)
     gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
-    block_gains(window.entropy, np.zeros(s.shape, np.int32), np.zeros(0, np.int64), block, gain, sums, hidden)
+    block_gains(window.entropy, behind, sizes, block, gain, sums, hidden)
     places = block_places(window.reachable, block, sums, max(1, round(1.0 / s.resolution_m)))
-    piece_of = np.zeros(blocks, np.int64)
-    piece_of[block[block >= 0]] = labels[block >= 0]
-    return _select(gain, np.zeros(blocks, np.bool_), places, piece_of, window, least)
+    piece_of, inside = np.zeros(blocks, np.int64), block >= 0
+    piece_of[block[inside]] = labels[inside]
+    return _Blocks(gain, hidden, places, piece_of)
 
 
 def near_robot(window: Window, range_m: float) -> NDArray[np.bool_]:

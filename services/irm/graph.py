@@ -21,6 +21,11 @@ ROBOT = 0
 Key = int | tuple[int, int]
 
 
+def edge_key(a: int, b: int) -> tuple[int, int]:
+    """The name of an edge, whichever end comes first."""
+    return min(a, b), max(a, b)
+
+
 class RoadGraph:
     """Nodes with x, y, z, kind, gain, coverage; edges with distance, risk, driven. All changes go through here.
 
@@ -110,7 +115,7 @@ class RoadGraph:
         """Add an edge or replace what is known of it."""
         is_new = not self.graph.has_edge(a, b)
         self.graph.add_edge(a, b, distance=distance, risk=risk, driven=driven)
-        self._changed.add((min(a, b), max(a, b)))
+        self._changed.add(edge_key(a, b))
         if is_new and self._is_crumb(a) and self._is_crumb(b):
             self._components.join(a, b)
 
@@ -119,11 +124,11 @@ class RoadGraph:
         if a > b:  # the line turned round: 1 - t along it, and -s across
             way = [1.0 - v if i % 2 == 0 else -v for i, v in enumerate(way)]
         self.graph.edges[a, b]["way"] = way
-        self._new_ways.add((min(a, b), max(a, b)))
+        self._new_ways.add(edge_key(a, b))
 
     def drop_edge(self, a: int, b: int) -> None:
         """Remove an edge."""
-        key = min(a, b), max(a, b)
+        key = edge_key(a, b)
         was_shut = key in self.shut
         self.graph.remove_edge(a, b)
         self.shut.discard(key)
@@ -143,7 +148,7 @@ class RoadGraph:
 
     def open_edge(self, a: int, b: int) -> None:
         """An edge is not shut any more."""
-        key = min(a, b), max(a, b)
+        key = edge_key(a, b)
         if key not in self.shut:
             return
         self.shut.discard(key)
@@ -153,7 +158,7 @@ class RoadGraph:
 
     def is_open(self, a: int, b: int) -> bool:
         """Whether an edge is not shut."""
-        return not self.shut or (min(a, b), max(a, b)) not in self.shut
+        return not self.shut or edge_key(a, b) not in self.shut
 
     def _is_crumb(self, node: int) -> bool:
         return node != ROBOT and bool(self.graph.nodes[node]["kind"] == BREADCRUMB)
@@ -220,7 +225,7 @@ class RoadGraph:
 
     def _all_keys(self) -> Iterable[Key]:
         yield from self.graph.nodes
-        yield from ((min(a, b), max(a, b)) for a, b in self.graph.edges)
+        yield from (edge_key(a, b) for a, b in self.graph.edges)
 
     def _exists(self, key: Key) -> bool:
         if isinstance(key, int):
@@ -240,7 +245,7 @@ class RoadGraph:
         """For a snapshot."""
         return {
             "nodes": [[n, dict(d)] for n, d in sorted(self.graph.nodes(data=True))],
-            "edges": sorted([min(a, b), max(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
+            "edges": sorted([*edge_key(a, b), dict(d)] for a, b, d in self.graph.edges(data=True)),
             "unpublished": self._unpublished(),
         }
 

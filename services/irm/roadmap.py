@@ -18,7 +18,7 @@ from services.irm.config import Config
 from services.irm.driven import REFUTED, Trail
 from services.irm.driven import placed as placed_way
 from services.irm.frontiers import ISOLATED, Frontier, FrontierManager
-from services.irm.graph import ROBOT, RoadGraph
+from services.irm.graph import ROBOT, RoadGraph, edge_key
 from services.irm.keyframes import Anchor
 from services.irm.out_of_reach import Place
 from services.irm.search import Search, path_totals
@@ -125,7 +125,7 @@ class Roadmap:
         keys: list[tuple[int, int]] = []
         lines: list[tuple[tuple[float, float], tuple[float, float]]] = []
         for a, b, edge in self.graph.edges(data=True):
-            low, high = min(a, b), max(a, b)
+            low, high = edge_key(a, b)
             if low == ROBOT or (low, high) in self.clear:
                 continue
             ends = self.road.place(low), self.road.place(high)
@@ -161,7 +161,7 @@ class Roadmap:
         frontiers = [n for n in self.manager.follow(keyframes) if n in self.graph]
         crumbs = self.road.belonging(keyframes)
         before = {
-            (min(a, b), max(a, b)): self.road.straight_m(a, b)
+            edge_key(a, b): self.road.straight_m(a, b)
             for a in (*crumbs, *frontiers)
             for b in self.graph.neighbors(a)
         }
@@ -236,10 +236,10 @@ class Roadmap:
         if d < self.config.max_edge_m and rho < self.config.max_edge_risk and not self._stacked(a, b):
             driven = self.graph.edges[a, b]["driven"] if self.graph.has_edge(a, b) else 0
             self.road.set_edge(a, b, self._climbed_m(a, b, d), rho, driven)
-            self.refuted.pop((min(a, b), max(a, b)), None)
+            self.refuted.pop(edge_key(a, b), None)
             if self.fences.shuts:
                 self.road.open_edge(a, b)
-                self.clear.add((min(a, b), max(a, b)))
+                self.clear.add(edge_key(a, b))
             return True
         if not (self.graph.has_edge(a, b) and search.knows(*target)):
             return False
@@ -247,7 +247,7 @@ class Roadmap:
             return False  # that a fence is in the way says nothing of the ground
         held = self.graph.edges[a, b]
         if math.isfinite(d):
-            self.refuted.pop((min(a, b), max(a, b)), None)
+            self.refuted.pop(edge_key(a, b), None)
         if held["driven"] and d < 2.0 * self.config.max_edge_m and not self._stacked(a, b):
             # Riskier than thought, perhaps, but it leads there: the robot must not be cut off from where it came from.
             self.road.set_edge(a, b, self._climbed_m(a, b, d), min(rho, _MOST_RISK), 1)
@@ -260,13 +260,15 @@ class Roadmap:
 
     def _is_refuted(self, a: int, b: int, search: Search) -> bool:
         """Whether something stands, time after time, where the robot went from a to b."""
-        low, high = (self.road.place(n) for n in (min(a, b), max(a, b)))
-        held = self.graph.edges[a, b]
-        way = placed_way(low, high, held["way"]) if held.get("way") else [low, high]
-        times = self.refuted.pop((min(a, b), max(a, b)), 0) + 1
-        if search.obstacle_on(way) and times < REFUTED:
-            self.refuted[min(a, b), max(a, b)] = times
-        return search.obstacle_on(way) and times >= REFUTED
+        edge = edge_key(a, b)
+        low, high = (self.road.place(n) for n in edge)
+        shares = self.graph.edges[edge].get("way")
+        times = self.refuted.pop(edge, 0) + 1
+        if not search.obstacle_on(placed_way(low, high, shares) if shares else [low, high]):
+            return False
+        if times < REFUTED:
+            self.refuted[edge] = times
+        return times >= REFUTED
 
     def _stacked(self, a: int, b: int) -> bool:
         """Whether two nodes lie on floors above one another."""

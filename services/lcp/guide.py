@@ -56,7 +56,8 @@ def _farthest(
         if node >= 0:
             return node
     for i in range(len(places) - 1, 0, -1):
-        for node in _on_piece(irm, usable, places[i - 1], places[i], pieces[i - 1] == pieces[i]):
+        node = next(_on_piece(irm, usable, places[i - 1], places[i], pieces[i - 1] == pieces[i]), -1)
+        if node >= 0:
             return node
     return -1
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from planning.coverage_model import ACTIONS, BITS, rollout_value, search_coverage
+from planning.coverage_model import ACTIONS, BITS, CoverageModel, rollout_value, search_coverage
 from planning.lattice_graph import spread_values, travel_costs
 from planning.pomcp import PolicyTree, Pomcp, random_stream
 from planning.randomness import stream
@@ -139,9 +139,7 @@ class LcpStage:
             view = self._next_view.choose(irm, model, junction, request.episode)
         if view is None:
             return self._guide(now, request, irm, junction, policy)
-        soon = covered_by(model, junction.node, junction.heading, view.moves[: self._config.promise_moves])
-        self._promises.note(now, (index for index in uncovered if soon[_node(irm, index)]), uncovered)
-        terms = step_terms(model, junction.node, junction.heading, view.moves)
+        terms = self._promise(now, irm, model, junction, view.moves, uncovered)
         reason = f"goes to a view worth {view.reward:.2f}"
         return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, view.moves, 0,
                        _EMPTY_TREE, view.reward, 0, 0, 0.0, terms)  # fmt: skip
@@ -206,11 +204,23 @@ class LcpStage:
             self._config.value_rollouts,
         )
         reason = f"covers: value {root.best_value:.2f} by {report.simulations} simulations"
-        soon = covered_by(model, junction.node, junction.heading, moves[: self._config.promise_moves])
-        self._promises.note(now, (index for index in uncovered if soon[_node(irm, index)]), uncovered)
-        terms = step_terms(model, junction.node, junction.heading, moves)
+        terms = self._promise(now, irm, model, junction, moves, uncovered)
         return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, moves, in_tree, tree,
                        float(root.best_value), report.simulations, report.nodes, float(rollout), terms)  # fmt: skip
+
+    def _promise(
+        self,
+        now: Stamp,
+        irm: LocalIrm,
+        model: CoverageModel,
+        junction: Junction,
+        moves: list[int],
+        uncovered: dict[Index, float],
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Note what a path promises to cover soon. Returns its `step_terms`."""
+        soon = covered_by(model, junction.node, junction.heading, moves[: self._config.promise_moves])
+        self._promises.note(now, (index for index in uncovered if soon[_node(irm, index)]), uncovered)
+        return step_terms(model, junction.node, junction.heading, moves)
 
     def _deadline(self) -> Callable[[], bool] | None:
         """Whether the planning time of this episode is over; None where time is not measured (lock-step)."""

@@ -118,7 +118,7 @@ class Driven:
         odometry: Odometry,
         follower: FollowerState | None,
         plan_id: int,
-        ground: Ground | None = None,
+        ground: Ground,
     ) -> bool:
         """Where the robot is on its path. Returns whether the path was dropped: left, or no way on along it.
 
@@ -139,9 +139,8 @@ class Driven:
         if dropped:
             self.drop("off the path")
         else:
-            dropped = self._meet_trouble(now, odometry, follower, plan_id) or (
-                ground is not None and self._leave_tight_place(now, odometry, ground)
-            )
+            dropped = self._meet_trouble(now, odometry, follower, plan_id)
+            dropped = dropped or self._leave_tight_place(now, odometry, ground)
         if self.backing and (self.left_m() < STEP_M or now - self.backing_ns > _BACKING_S * SECOND_NS):
             self.drop("backed off")
             dropped = True

@@ -45,11 +45,8 @@ class EventList(BaseModel):
 def _content(
     kind: str, says: str, more: dict[int | str, dict[str, Any]] | None = None
 ) -> dict[int | str, Any]:
-    schema = (
-        {"type": "string"}
-        if kind.startswith(("text", "application"))
-        else {"type": "string", "format": "binary"}
-    )
+    binary: dict[str, Any] = {"type": "string", "format": "binary"}
+    schema = {"type": "string"} if kind.startswith("text/") else binary if kind.startswith("image/") else {}
     return {200: {"content": {kind: {"schema": schema}}, "description": says}, **(more or {})}
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from http import HTTPStatus
 from typing import Any
@@ -113,7 +114,9 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     def _http(request: Request, error: HTTPException) -> Response:
-        headers = dict(error.headers) if error.headers else None
+        headers = dict(error.headers) if error.headers else {}
+        if error.status_code == 405:  # Starlette names the methods of one of the routes of this path alone
+            headers["Allow"] = ", ".join(_allowed(app, request.url.path)) or headers.get("Allow", "GET")
         return problem_response(ProblemError(error.status_code, str(error.detail), headers=headers))
 
     @app.exception_handler(RequestValidationError)
@@ -128,6 +131,16 @@ def install(app: FastAPI) -> None:
         return problem_response(ProblemError(500, detail))
 
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
+
+
+def _allowed(app: FastAPI, path: str) -> list[str]:
+    """The methods of a path, by the document."""
+    found: set[str] = set()
+    for template, operations in app.openapi()["paths"].items():
+        pattern = "[^/]+".join(re.escape(part) for part in re.split(r"\{[^}]+\}", template))
+        if re.fullmatch(pattern, path):
+            found |= {method.upper() for method in operations}
+    return sorted(found)
 
 
 _COMMON = {
@@ -155,8 +168,10 @@ def _document(app: FastAPI) -> dict[str, Any]:
     parts.update(schema.pop("$defs", {}))
     parts["Problem"] = schema
     for path in document["paths"].values():
-        for operation in path.values():
+        for method, operation in path.items():
             _describe(operation)
+            if method == "get" and "security" in operation:
+                operation["security"].append({})  # reading needs no token on a loopback address
     app.openapi_schema = document
     return document
 

@@ -42,9 +42,9 @@ def test_a_geofence_bounds_a_mission_that_still_ends_covered(tmp_path: Path) -> 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_ground_behind_a_fence_that_is_removed_is_explored(tmp_path: Path) -> None:
-    script = {0.5: draw("a", FenceKind.NO_GO, *EAST), 45.0: command("b", CommandKind.UNFENCE)}
+    script = {0.5: draw("a", FenceKind.NO_GO, *EAST), 22.0: command("b", CommandKind.UNFENCE)}
     run = mission(tmp_path, script)
-    run.until(lambda seen: len(seen.answers) == 2, 60.0)
+    run.until(lambda seen: len(seen.answers) == 2, 40.0)
     assert run.seen.inside(*EAST) == 0
     end = run.to_its_end()
     assert end.finish == FinishReason.COVERED

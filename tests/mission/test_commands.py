@@ -47,6 +47,10 @@ class Bench:
         self.state = next(m for m in found if isinstance(m, MissionState))
         return [m for m in found if isinstance(m, CommandAnswer)]
 
+    def phase(self) -> MissionPhase:
+        assert self.state is not None
+        return self.state.phase
+
     def ask(self, kind: CommandKind, name: str = "a", **more: Any) -> CommandAnswer:
         (answer,) = self.step(MissionCommand(stamp_ns=self.now, command_id=name, kind=kind, **more))
         return answer
@@ -155,14 +159,14 @@ def test_the_time_budget_changes_and_a_robot_that_turned_back_goes_on() -> None:
     for _ in range(12):
         bench.x_m += 1.0
         bench.step()
-    assert bench.state is not None
-    assert bench.state.phase == MissionPhase.RETURN
+    assert bench.phase() == MissionPhase.RETURN
     more = bench.ask(CommandKind.BUDGET, "1", time_budget_s=900.0)
     assert "900 s (was 5 s)" in more.reason
+    assert bench.state is not None
     assert bench.state.time_budget_s == 900.0
-    assert bench.state.phase == MissionPhase.EXPLORE
+    assert bench.phase() == MissionPhase.EXPLORE
     bench.ask(CommandKind.BUDGET, "2", time_budget_s=6.0)
-    assert bench.state.phase == MissionPhase.RETURN
+    assert bench.phase() == MissionPhase.RETURN
 
 
 def test_fences_and_answers_survive_a_restart() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, settings
@@ -12,13 +14,13 @@ from services.status.config import Config
 from services.status.security import Access, Role, Token, _digest
 from tests.status.mission_behind import MissionBehind
 from tests.status.test_api import SECRET
-from tests.status.test_app import fill
+from tests.status.test_app import Clock, fill
 
 _HEADERS = {"Authorization": f"Bearer {SECRET}", "Host": "127.0.0.1:8080"}
 
 
 def _application() -> object:
-    shared = SharedStatus(Config(), "husky1")
+    shared = SharedStatus(Config(), "husky1", Clock())
     fill(shared)
     MissionBehind(shared)
     app = create_app(shared)
@@ -40,7 +42,7 @@ schema = schemathesis.openapi.from_asgi("/openapi.json", _application(), headers
     phases=(Phase.explicit, Phase.generate),
     suppress_health_check=list(HealthCheck),
 )
-def test_every_answer_is_in_the_document(case: Case) -> None:
+def test_every_answer_is_in_the_document(case: Case[Any]) -> None:
     # Whether a ring is closed and does not cross itself is more than a JSON schema can say: 422 is right for it.
     checks = [schemathesis.checks.positive_data_acceptance]
     case.call_and_validate(headers=_HEADERS, excluded_checks=checks)
