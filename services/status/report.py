@@ -143,6 +143,7 @@ class StageReport(_Part):
     pid: int = 0
     errors: int = 0
     last_error: str = ""
+    degraded: str = Field("", description="What it has to do without, such as its journal; empty: nothing.")
     dropped: dict[str, int] = {}
     waiting_for: list[str] = []
 
