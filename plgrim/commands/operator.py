@@ -181,9 +181,7 @@ def _draw(
         )
     chosen = frame or geojson.get("frame")
     if chosen not in ("map", "odom"):
-        raise ConfigError(
-            f"{file}: frame: {chosen!r} is neither map nor odom; say --frame map"
-        )
+        raise ConfigError(f"{file}: frame: {chosen!r} is neither map nor odom; say --frame map")
     drawn = {"kind": kind, "frame": chosen, "geojson": geojson, "name": file.stem[:128], **more}
     try:
         _carry_out("fence", key, as_json, config_file, fence=drawn)

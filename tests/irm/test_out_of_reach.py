@@ -23,9 +23,10 @@ def seen(flat: Flat) -> Window:
 
 
 def test_a_room_behind_a_slit_is_closed_off_and_one_behind_a_door_is_not() -> None:
-    ((x, y, area_m2),) = closed_off(seen(two_rooms(door_m=0.3)), RADIUS_M, RADIUS_M)
+    ((x, y, area_m2, fenced),) = closed_off(seen(two_rooms(door_m=0.3)), RADIUS_M, RADIUS_M)
     assert -0.1 <= x <= 0.3 and abs(y) <= 0.2, "named by the slit"
     assert area_m2 == pytest.approx(25.0, abs=0.3)
+    assert not fenced
     assert closed_off(seen(two_rooms(door_m=1.0)), RADIUS_M, RADIUS_M) == []
 
 
