@@ -13,7 +13,7 @@ from schemas.contract import SECOND_NS, Resuming, StageSetup
 from schemas.operation import MissionPhase, SupervisorReport
 from schemas.policy import EpisodeRequest, LocalPhase, Plan, SafetyState
 from schemas.snapshot import unpack_snapshot
-from schemas.topics import LOCAL_POLICY, MOVING, RISK_MAP, SUPERVISOR
+from schemas.topics import FENCES, LOCAL_POLICY, MOVING, RISK_MAP, SUPERVISOR
 from services.reconciler.config import Config
 from services.reconciler.stage import create, spec
 from services.reconciler.trail import Trail
@@ -499,7 +499,7 @@ def test_after_a_restart_ids_go_on_increasing() -> None:
 
 def test_the_stage_runs_on_risk_maps_and_answers() -> None:
     assert spec(FEW).period_ns == TICK_NS
-    assert set(spec(FEW).triggers) == {RISK_MAP.name, MOVING.name, LOCAL_POLICY.name}
+    assert set(spec(FEW).triggers) == {RISK_MAP.name, MOVING.name, LOCAL_POLICY.name, FENCES.name}
     assert isinstance(Feed("reconciler", create(FEW, StageSetup("robot", 0))), Feed)
 
 
