@@ -17,6 +17,8 @@ import pytest
 
 from tests.faults.network import BASE, ROBOT, Network, cut_off, require_network
 
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
 FAKES = ("-m", "tests.link.fakes")
 ROBOT_TOPICS = "gcp/global_policy,sim/odometry,irm/global_irm,riskmap/risk_map,link/report,status/command"
 BASE_TOPICS = (
