@@ -143,8 +143,8 @@ class StepLog:
 
     def said(self, output: Output, payload: bytes, sent_ns: Stamp) -> None:
         """The step has made this output."""
-        assert self._outbox is not None
         if self._listening:
+            assert self._outbox is not None
             name = output.topic.name
             self._said.append((name, self._outbox.sequence[name], sent_ns, xxhash.xxh3_64_intdigest(payload)))
 

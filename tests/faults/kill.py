@@ -91,12 +91,21 @@ def _lost(handover: Handover) -> bool:
 
 
 class Killer:
-    """Runs one mission and kills through a list while it lasts. gap_s: range of the wall time between two kills."""
+    """Runs one mission and kills through a list while it lasts. gap_s: range of the wall time between two kills.
 
-    def __init__(self, config: Config, folder: Path, gap_s: tuple[float, float] = (2.0, 6.0)) -> None:
+    spare_wait_s: longest wait for the supervisor's spare before each.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        folder: Path,
+        gap_s: tuple[float, float] = (2.0, 6.0),
+        spare_wait_s: float = _SPARE_WAIT_S,
+    ) -> None:
         self._config = config
         self._folder = folder
-        self._gap_s = gap_s
+        self._gap_s, self._spare_wait_s = gap_s, spare_wait_s
         self._rng: np.random.Generator = stream(config.seed, "faults", "kill")
         self._observer = Observer()
         self._kills: list[Kill] = []
@@ -137,7 +146,7 @@ class Killer:
         The random gap begins anew then, so that the phase of the kill is random all the same.
         """
         waited_s = time.monotonic() - self._due_s
-        if not supervisor.spare_warm and waited_s < _SPARE_WAIT_S:
+        if not supervisor.spare_warm and waited_s < self._spare_wait_s:
             self._waited = True
             return False
         if self._waited:

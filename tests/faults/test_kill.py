@@ -31,7 +31,8 @@ def _faults(missions: list[Mission]) -> list[str]:
 
 def test_irm_killed_once_in_a_small_world(tmp_path: Path) -> None:
     sim = {"map_file": str(write_small_map(tmp_path)), "start": START}
-    mission = Killer(fault_config(sim, 1, 3.0), tmp_path / "run", gap_s=(2.0, 3.0)).run(["irm"], 90.0)
+    killer = Killer(fault_config(sim, 1, 3.0), tmp_path / "run", gap_s=(2.0, 3.0), spare_wait_s=0.0)
+    mission = killer.run(["irm"], 90.0)
     assert _faults([mission]) == []
     assert [kill.service for kill in mission.kills] == ["irm"]
     (handover,) = mission.handovers

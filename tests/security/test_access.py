@@ -177,6 +177,8 @@ def test_every_process_reads_what_the_table_gives_it_and_nothing_else(everything
             _listen(links[process], expression, into)
     own = {p: {topic.key(ROBOT) for topic in every_topic() if topic.writer == p} for p in ears}
     allowed = {p: {t.key(ROBOT) for t in said(links) if p in t.readers} - own[p] for p in ears}
+    looks_on = SUPERVISOR.writer  # it hears all that the result is made of
+    allowed[looks_on] = {t.key(ROBOT) for t in said(links)} - own[looks_on]
 
     def foreign(process: str) -> set[str]:
         """What a process hears from others; its own words it hears without any router."""

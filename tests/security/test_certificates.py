@@ -192,7 +192,14 @@ def test_the_commands(tmp_path: Path) -> None:
     ca, out = str(tmp_path / "ca"), str(tmp_path / "certs")
     run("init", "--ca", ca)
     run("issue", "--ca", ca, "--role", "base", "--robot", "husky1", "--host", "base.local", "--out", out)
-    assert {p.name for p in (tmp_path / "certs").iterdir()} == {"router", "gcp", "status", "tools"}
+    assert {p.name for p in (tmp_path / "certs").iterdir()} == {
+        "router",
+        "gcp",
+        "status",
+        "supervisor",
+        "tools",
+        "operator",
+    }
     run("revoke", "gcp.base.husky1", "--ca", ca)
     assert "renewed" in run("trust", "--ca", ca, "--out", out)
     listed = run("list", "--ca", ca)

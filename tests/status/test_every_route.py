@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections.abc import Iterator
 from typing import Any
 from urllib.parse import quote
@@ -88,7 +89,7 @@ def sockets(app: FastAPI) -> list[str]:
 
 def filled(path: str) -> str:
     """A path with something in place of its parameters."""
-    return "/".join("1" if part.startswith("{") else part for part in path.split("/"))
+    return re.sub(r"\{[^}]*\}", "1", path)
 
 
 def bearer(secret: str) -> dict[str, str]:
