@@ -126,6 +126,7 @@ class Killer:
                 self._look()
                 if (
                     services
+                    and supervisor.children[services[0]].ready
                     and time.monotonic() >= self._due_s
                     and self._all_back()
                     and self._is_whole(supervisor)
@@ -163,8 +164,7 @@ class Killer:
 
     def _kill(self, child: Child) -> None:
         process = child.process
-        if process is None or not child.ready:
-            return
+        assert process is not None
         mission = self._observer.mission
         mission_s = mission.elapsed_s if mission else 0.0
         epoch = self._observer.health[child.name].epoch
