@@ -13,6 +13,9 @@ _MOST_POINTS = 200
 _LEAST_M = 0.5
 """A way between ends that are nearer to one another has no direction to be told in."""
 
+REFUTED_WITHIN_M = 5.0
+"""What stands there counts when it is seen from so near: from farther away, a slope that falls off behind a stone looks
+closed, where the robot went itself."""
 REFUTED = 3
 """A way that was found blocked so often in a row is closed: once may be a person, or noise on a slope."""
 

@@ -15,7 +15,7 @@ from planning.frames import Planar
 from schemas.base import Pose
 from schemas.world import BREADCRUMB, FRONTIER, GlobalIrm
 from services.irm.config import Config
-from services.irm.driven import REFUTED, Trail
+from services.irm.driven import REFUTED, REFUTED_WITHIN_M, Trail
 from services.irm.driven import placed as placed_way
 from services.irm.frontiers import ISOLATED, Frontier, FrontierManager
 from services.irm.graph import ROBOT, RoadGraph, edge_key
@@ -264,7 +264,7 @@ class Roadmap:
         low, high = (self.road.place(n) for n in edge)
         shares = self.graph.edges[edge].get("way")
         times = self.refuted.pop(edge, 0) + 1
-        if not search.obstacle_on(placed_way(low, high, shares) if shares else [low, high]):
+        if not search.obstacle_on(placed_way(low, high, shares) if shares else [low, high], REFUTED_WITHIN_M):
             return False
         if times < REFUTED:
             self.refuted[edge] = times

@@ -52,17 +52,19 @@ class Search:
         row, column = self._window.cell(x_m, y_m)
         return self._window.spec.contains(row, column) and self._window.state[row, column] != 0
 
-    def obstacle_on(self, line: Sequence[tuple[float, float]]) -> bool:
-        """Whether a lethal cell lies on a line of points."""
-        return any(self._obstacle_between(a, b) for a, b in pairwise(line))
+    def obstacle_on(self, line: Sequence[tuple[float, float]], within_m: float = math.inf) -> bool:
+        """Whether a lethal cell lies on a line of points, no farther than so from the robot."""
+        return any(self._obstacle_between(a, b, within_m) for a, b in pairwise(line))
 
-    def _obstacle_between(self, a: tuple[float, float], b: tuple[float, float]) -> bool:
-        spec, state = self._window.spec, self._window.state
+    def _obstacle_between(self, a: tuple[float, float], b: tuple[float, float], within_m: float) -> bool:
+        spec, state, robot = self._window.spec, self._window.state, self._window.robot_cell
         steps = max(1, math.ceil(2.0 * math.dist(a, b) / spec.resolution_m))
         for i in range(steps + 1):
             at = (a[0] + (b[0] - a[0]) * i / steps, a[1] + (b[1] - a[1]) * i / steps)
             row, column = self._window.cell(*at)
-            if spec.contains(row, column) and state[row, column] == LETHAL:
+            if not spec.contains(row, column) or state[row, column] != LETHAL:
+                continue
+            if math.dist((row, column), robot) * spec.resolution_m <= within_m:
                 return True
         return False
 

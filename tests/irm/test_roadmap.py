@@ -269,6 +269,24 @@ def test_a_driven_way_round_a_corner_goes_only_when_something_stands_on_it(close
     assert [drive.roadmap.graph.has_edge(*e) for e in across] == [not closed] * len(across)
 
 
+def test_what_seems_to_stand_on_a_driven_way_far_off_does_not_close_it() -> None:
+    """From ten metres a slope behind a stone looks closed; from near it is looked at again."""
+    drive = Drive(room(-1.0, -1.0, 15.0, 1.0, RES), window_m=24.0)
+    for x in np.arange(0.0, 12.5, 0.5):
+        drive.to(float(x), 0.0)
+    edge = next(
+        e for e in drive.roadmap.graph.edges
+        if ROBOT not in e and drive.crosses(e, 3.0) and drive.roadmap.graph.edges[e]["driven"]
+    )  # fmt: skip
+    drive.flat.fill(2.8, -1.0, 3.2, 1.0, LETHAL)
+    drive.stay(12.0, 0.0)
+    assert drive.roadmap.graph.has_edge(*edge), "ten metres away"
+    for x in np.arange(11.5, 5.5, -0.5):
+        drive.to(float(x), 0.0)
+    drive.stay(6.0, 0.0)
+    assert not drive.roadmap.graph.has_edge(*edge), "three metres away"
+
+
 @given(
     ends=st.tuples(*[st.tuples(st.floats(-50, 50), st.floats(-50, 50))] * 2),
     points=st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=1, max_size=8),
