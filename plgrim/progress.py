@@ -61,6 +61,8 @@ class MissionProgress:
         self._live = Live(console=console, refresh_per_second=4, transient=True, auto_refresh=False)
 
     def __enter__(self) -> MissionProgress:
+        if self._page:
+            self._console.print(f"page: {self._page}", soft_wrap=True, highlight=False, markup=False)
         if self._console.is_terminal:
             self._live.start()
         return self
@@ -98,8 +100,6 @@ class MissionProgress:
             ProgressBar(total=1.0, completed=coverage.covered_fraction if coverage else 0.0, width=60)
         )
         rows.add_row(Text(target_text(self._recorder), overflow="ellipsis"))
-        if self._page:
-            rows.add_row(Text(f"status  {self._page}", style="dim"))
         return rows
 
 
