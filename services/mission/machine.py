@@ -15,6 +15,10 @@ from services.mission.config import Config
 
 _OVER = (MissionPhase.DONE, MissionPhase.STOPPED)
 _REMEMBERED_COMMANDS = 256
+_REBASE_M2 = 20.0
+"""A fall of the covered area by more than this is ground that was cut off, not noise, ..."""
+_MOST_REBASES = 3
+"""... so many times in a row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +70,8 @@ class Machine:
     last_step_ns: int = -1
     idle_ns: int = 0
     best_area_m2: float = 0.0
+    peak_area_m2: float = 0.0
+    rebased: int = 0
     best_return_m: float = math.inf
     time_budget_s: float = -1.0
     seen: list[str] = field(default_factory=list)
@@ -270,6 +276,8 @@ class Machine:
 
     def _check_progress(self, facts: Facts) -> None:
         area = facts.covered_area_m2
+        if area is not None:
+            self._rebase(area)
         grown = area is not None and area >= self.best_area_m2 + self.config.progress_min_m2
         self._count_idle(grown, facts)
         if grown and area is not None:
@@ -277,6 +285,18 @@ class Machine:
         if self.idle_ns >= self.config.no_progress_s * SECOND_NS:
             reason = f"nothing new covered for {self.config.no_progress_s:g} s, {facts.left} places left"
             self._end_or_go_home(FinishReason.NO_PROGRESS, reason, self.config.return_when_done, facts)
+
+    def _rebase(self, area_m2: float) -> None:
+        """Count from less when ground that was covered is no longer believed to be in reach.
+
+        Else a robot that covers new ground elsewhere makes no progress until that loss is made up for. So often only,
+        unless there is more than ever before: ground that comes and goes is no progress.
+        """
+        if area_m2 >= self.peak_area_m2 + self.config.progress_min_m2:
+            self.peak_area_m2, self.rebased = area_m2, 0
+        if self.best_area_m2 - area_m2 > _REBASE_M2 and self.rebased < _MOST_REBASES:
+            self.best_area_m2 = area_m2
+            self.rebased += 1
 
     def _count_idle(self, progress: bool, facts: Facts) -> None:
         """Time without progress; pauses do not count, since the timer runs from step to step."""

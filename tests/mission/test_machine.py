@@ -151,6 +151,26 @@ def test_energy_budget_counts_from_the_start() -> None:
     assert driver.machine.pending == FinishReason.ENERGY_BUDGET
 
 
+def test_new_ground_is_progress_though_more_was_cut_off() -> None:
+    driver = Driver(no_progress_s=30.0)
+    driver.run(60.0, growth_m2=1.0)
+    driver._area -= 60.0
+    driver.run(20.0)
+    driver.run(40.0, growth_m2=0.5)  # not yet what it was
+    assert driver.phase() == MissionPhase.EXPLORE
+
+
+def test_ground_that_comes_and_goes_is_no_progress_for_ever() -> None:
+    driver = Driver(no_progress_s=30.0)
+    driver.run(60.0, growth_m2=1.0)
+    for _ in range(20):
+        driver._area -= 40.0
+        driver.run(10.0)
+        driver._area += 40.0
+        driver.run(10.0)
+    assert driver.machine.finish == FinishReason.NO_PROGRESS
+
+
 def test_no_progress_does_not_count_pauses() -> None:
     driver = Driver(no_progress_s=30.0)
     driver.run(0.5)
