@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 
 class Planar(NamedTuple):
@@ -32,6 +32,27 @@ class Planar(NamedTuple):
     def is_identity(self) -> bool:
         """Whether applying it changes nothing."""
         return self == Planar(0.0, 0.0, 0.0)
+
+
+class Posed(Protocol):
+    """What lies in the plane of a frame: a pose of a message, for one. m, rad."""
+
+    @property
+    def x_m(self) -> float: ...
+    @property
+    def y_m(self) -> float: ...
+    @property
+    def yaw_rad(self) -> float: ...
+
+
+def planar(pose: Posed) -> Planar:
+    """A pose, or the pose of a frame, without height, roll and pitch."""
+    return Planar(pose.x_m, pose.y_m, pose.yaw_rad)
+
+
+def in_map(map_to_odom: Posed, pose: Posed) -> Planar:
+    """A pose of `odom` in `map`: map_to_odom after the pose."""
+    return planar(map_to_odom).compose(planar(pose))
 
 
 def wrap_angle(angle_rad: float) -> float:

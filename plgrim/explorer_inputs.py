@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.frames import Planar
+from planning.frames import Planar, planar
 from plgrim.errors import ExplorerInputError
 from schemas.base import Pose as WirePose
 from schemas.contract import Inputs, Output, Outputs, StageSpec, Stamp
@@ -222,7 +222,7 @@ class GivenSensors:
 
     def _scan(self, look: Look, now: Stamp) -> CoverageScan:
         first = max(0, len(self._keyframes) - _RECENT)
-        here = Planar(self._pose.x_m, self._pose.y_m, self._pose.yaw_rad)
+        here = planar(self._pose)
         nearest = first + int(np.argmin(np.hypot(*(self._keyframes[first:, :2] - here[:2]).T)))
         x, y, _, yaw = self._keyframes[nearest].tolist()
         relative = Planar(x, y, yaw).inverse().compose(here)

@@ -16,6 +16,11 @@ Stamp = int
 SECOND_NS = 1_000_000_000
 
 
+def root_of(robot: str) -> str:
+    """What all Zenoh keys of a robot begin with."""
+    return f"plgrim/@v1/{robot}"
+
+
 @dataclass(frozen=True, slots=True)
 class Topic(Generic[M_co]):
     """One row of the table of topics (`schemas/topics.py`).
@@ -45,7 +50,8 @@ class Topic(Generic[M_co]):
         instance: `base` or `standby` for what one of two instances of a service says, before it is settled who is
         obeyed: `plgrim/@v1/<robot>/<instance>/<service>/<noun>`.
         """
-        return f"plgrim/@v1/{robot}/{instance}/{self.name}" if instance else f"plgrim/@v1/{robot}/{self.name}"
+        root = root_of(robot)
+        return f"{root}/{instance}/{self.name}" if instance else f"{root}/{self.name}"
 
 
 @dataclass(frozen=True, slots=True)

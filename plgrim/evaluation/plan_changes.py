@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from planning.frames import Planar
+from planning.frames import Planar, planar
 from schemas.contract import SECOND_NS, Stamp
 from schemas.policy import Plan
 from schemas.sensing import Odometry
@@ -124,7 +124,7 @@ class PlanChanges:
     def see_pose(self, odometry: Odometry) -> None:
         """Take in where the robot is."""
         frame = odometry.map_to_odom
-        self._frame, self._yaw_rad = Planar(frame.x_m, frame.y_m, frame.yaw_rad), odometry.pose.yaw_rad
+        self._frame, self._yaw_rad = planar(frame), odometry.pose.yaw_rad
 
     def see_plan(self, plan: Plan, now: Stamp) -> None:
         """Take in a plan as it is published."""

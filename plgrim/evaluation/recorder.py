@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from planning.frames import Planar
+from planning import frames
 from plgrim.evaluation.events import EventLog
 from plgrim.evaluation.plan_changes import PlanChanges
 from schemas.base import Message, Pose
@@ -54,7 +54,7 @@ def quantile(values: Sequence[float], share: float) -> float | None:
 def in_map(odometry: Odometry) -> Pose:
     """The robot's pose in `map`: map_to_odom after the pose in `odom`."""
     frame, pose = odometry.map_to_odom, odometry.pose
-    x, y, yaw = Planar(frame.x_m, frame.y_m, frame.yaw_rad).compose(Planar(pose.x_m, pose.y_m, pose.yaw_rad))
+    x, y, yaw = frames.in_map(frame, pose)
     return Pose(x_m=x, y_m=y, z_m=frame.z_m + pose.z_m, yaw_rad=yaw)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from planning.frames import Planar
+from planning.frames import Planar, in_map, planar
 from planning.graph_mirror import FRONTIER, GraphMirror
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS, Stamp
@@ -142,7 +142,7 @@ class FrameMaker:
         self._belief[place] = np.where(new > 0, new, old)
 
     def _drive(self, odometry: Odometry) -> None:
-        x, y, _ = _in_map(odometry.map_to_odom, odometry.pose)
+        x, y, _ = in_map(odometry.map_to_odom, odometry.pose)
         if not self._driven or abs(x - self._driven[-1][0]) + abs(y - self._driven[-1][1]) > 0.3:
             self._driven.append((x, y))
 
@@ -199,7 +199,7 @@ class FrameMaker:
     def _draw_robot(self, pen: ImageDraw.ImageDraw, canvas: _Canvas) -> None:
         if self._odometry is None:
             return
-        x, y, yaw = _in_map(self._odometry.map_to_odom, self._odometry.pose)
+        x, y, yaw = in_map(self._odometry.map_to_odom, self._odometry.pose)
         (px, py), d = canvas.px(np.array([[x, y]]))[0], 7.0 * _SCALE
         turned = [yaw, yaw + 2.5, yaw - 2.5]
         pen.polygon(
@@ -228,9 +228,5 @@ class FrameMaker:
 
 
 def _compose(frame: Pose, x: float, y: float) -> tuple[float, float]:
-    at = Planar(frame.x_m, frame.y_m, frame.yaw_rad).compose(Planar(x, y, 0.0))
+    at = planar(frame).compose(Planar(x, y, 0.0))
     return at.x_m, at.y_m
-
-
-def _in_map(frame: Pose, pose: Pose) -> Planar:
-    return Planar(frame.x_m, frame.y_m, frame.yaw_rad).compose(Planar(pose.x_m, pose.y_m, pose.yaw_rad))

@@ -18,7 +18,7 @@ from plgrim.runtime.pulse import Pulse
 from plgrim.runtime.watch import FLAG_PERIODS
 from plgrim.runtime.zenoh_session import Link
 from schemas.codec import decode
-from schemas.contract import Stamp
+from schemas.contract import Stamp, root_of
 from schemas.operation import StageHealth
 from schemas.topics import health_topic
 
@@ -30,12 +30,12 @@ _MIB = 1024 * 1024
 
 def token_key(robot: str, service: str, instance: str) -> str:
     """Key of a service's liveliness token; `*` as instance matches all of them."""
-    return f"plgrim/@v1/{robot}/{service}/alive/{instance}"
+    return f"{root_of(robot)}/{service}/alive/{instance}"
 
 
 def query_key(robot: str, service: str) -> str:
     """Key on which a service answers queries with its health."""
-    return f"plgrim/@v1/{robot}/{service}/health_now"
+    return f"{root_of(robot)}/{service}/health_now"
 
 
 def quantile(values: list[float], share: float) -> float:

@@ -13,9 +13,9 @@ from plgrim.runtime.keeper import Keeper
 from plgrim.runtime.mailbox import Mailbox, Outbox
 from plgrim.runtime.router import page_address
 from plgrim.runtime.service import LiveService
-from plgrim.security.access import COMMAND_QUERY, root_of
+from plgrim.security.access import COMMAND_QUERY
 from schemas.base import Message
-from schemas.contract import Output, Topic
+from schemas.contract import Output, Topic, root_of
 from schemas.topics import COMMAND, STATUS_GRAPH_REQUEST, read_by
 from services.status import app
 from services.status.commands import answer_json

@@ -19,7 +19,7 @@ from plgrim.logs import get_logger
 from plgrim.runtime.mailbox import Mailbox, Outbox
 from plgrim.runtime.zenoh_session import Link
 from schemas.base import Message
-from schemas.contract import Output, Stage, Stamp, Topic
+from schemas.contract import Output, Stage, Stamp, Topic, root_of
 from schemas.recording import StageSnapshot, StepRecord
 from schemas.snapshot import pack_snapshot
 from schemas.topics import snapshot_topic, steps_topic
@@ -32,7 +32,7 @@ _LONGEST_BACKLOG = 100_000
 
 def snapshot_query_key(robot: str, service: str) -> str:
     """Key on which a service takes a recorder's wish for a snapshot."""
-    return f"plgrim/@v1/{robot}/{service}/snapshot_now"
+    return f"{root_of(robot)}/{service}/snapshot_now"
 
 
 class NotedStopwatch:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from schemas.base import Message
-from schemas.contract import Topic
+from schemas.contract import Topic, root_of
 from schemas.topics import LINK, SERVICES, TOPICS, health_topic, recorder_topics
 
 TOOLS = "tools"
@@ -53,11 +53,6 @@ def every_topic() -> list[Topic[Message]]:
 def writers() -> tuple[str, ...]:
     """The services, and whoever else writes a topic."""
     return tuple(dict.fromkeys((*SERVICES, *(topic.writer for topic in every_topic()))))
-
-
-def root_of(robot: str) -> str:
-    """What all keys of a robot begin with."""
-    return f"plgrim/@v1/{robot}"
 
 
 def service_grant(service: str, robot: str, instance: str = "") -> Grant:

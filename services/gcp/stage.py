@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.frames import Planar
+from planning.frames import planar
 from planning.randomness import stream
 from planning.reward import RewardWeights
 from schemas.base import Pose
@@ -323,7 +323,7 @@ def _pieces_around(path_xyz_m: Floats, robot: Floats, radius_m: float) -> tuple[
 
 def _robot_xyz(frame: Pose, pose: Pose) -> tuple[float, float, float]:
     """The robot's place in `map`."""
-    x_m, y_m = Planar(frame.x_m, frame.y_m, frame.yaw_rad).apply(pose.x_m, pose.y_m)
+    x_m, y_m = planar(frame).apply(pose.x_m, pose.y_m)
     return x_m, y_m, frame.z_m + pose.z_m
 
 

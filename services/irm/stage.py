@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from planning.fences import FenceView
-from planning.frames import Planar
+from planning.frames import Planar, planar
 from planning.grid import UNKNOWN
 from schemas.base import Pose
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp
@@ -74,11 +74,6 @@ def spec(config: Config) -> StageSpec:
 def create(config: Config, setup: StageSetup) -> Stage:
     """An irm stage."""
     return IrmStage(config)
-
-
-def planar(pose: Pose) -> Planar:
-    """A pose in the plane."""
-    return Planar(pose.x_m, pose.y_m, pose.yaw_rad)
 
 
 class IrmStage:

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from planning.coverage_model import CoverageModel
+from planning.frames import planar
 from planning.randomness import stream
 from schemas.policy import GlobalPolicy
 from schemas.world import LocalIrm
 from services.lcp.config import HfeConfig, NbvConfig
-from services.lcp.problem import Junction, planar
+from services.lcp.problem import Junction
 from services.lcp.viewpoints import Ints, View, Ways, best_view, viewpoints_within, ways_from
 
 _LONGEST = 80

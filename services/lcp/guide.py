@@ -8,11 +8,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.frames import planar
 from planning.lattice_graph import travel_costs
 from schemas.policy import GlobalPolicy
 from schemas.world import LocalIrm
 from services.lcp.policy_path import moves_to
-from services.lcp.problem import node_at, planar
+from services.lcp.problem import node_at
 
 _AT_PLACE = 1.5
 """A node stands for a place of the path when its anchor is so near, in spacings."""

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.coverage_model import CoverageModel, RootBelief, build_model, reachable_entropy
-from planning.frames import Planar
+from planning.frames import planar
 from planning.lattice_graph import spread_values
 from planning.reward import RewardWeights, parameters
-from schemas.base import Pose
 from schemas.policy import EpisodeRequest, GlobalPolicy
 from schemas.world import LocalIrm
 from services.lcp.config import Config
@@ -83,11 +82,6 @@ def node_at(irm: LocalIrm, x_m: float, y_m: float) -> int:
     if not (0 <= row < irm.size and 0 <= column < irm.size):
         return -1
     return row * irm.size + column
-
-
-def planar(pose: Pose) -> Planar:
-    """A pose in the plane."""
-    return Planar(pose.x_m, pose.y_m, pose.yaw_rad)
 
 
 def coverage_model(

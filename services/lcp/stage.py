@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from planning.coverage_model import ACTIONS, BITS, CoverageModel, rollout_value, search_coverage
+from planning.frames import planar
 from planning.lattice_graph import spread_values, travel_costs
 from planning.pomcp import PolicyTree, Pomcp, random_stream
 from planning.randomness import stream
@@ -29,7 +30,6 @@ from services.lcp.problem import (
     leaf_values,
     local_entropy,
     node_at,
-    planar,
 )
 from services.lcp.promises import Index, Promises
 from services.lcp.viewpoints import warm_up_viewpoints

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.coverage import LOG_2
-from planning.frames import Planar
+from planning.frames import Planar, in_map, planar
 from planning.graph_mirror import FRONTIER, GraphMirror, RoadMap
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS, Inputs, Outputs, Stage, StageSetup, StageSpec, Stamp, Topic, outputs
@@ -158,7 +158,7 @@ class MissionStage:
     def _track(self, odometry: Odometry) -> None:
         """Follow the robot: distance in `odom`, where nothing jumps; place and home in `map`."""
         pose, frame = odometry.pose, odometry.map_to_odom
-        self._frame = Planar(frame.x_m, frame.y_m, frame.yaw_rad)
+        self._frame = planar(frame)
         self._at = _in_map(odometry)
         if self._home is None:
             self._home = self._at
@@ -328,7 +328,7 @@ class MissionStage:
 def _in_map(odometry: Odometry) -> Pose:
     """The robot's pose in `map`."""
     frame, pose = odometry.map_to_odom, odometry.pose
-    at = Planar(frame.x_m, frame.y_m, frame.yaw_rad).compose(Planar(pose.x_m, pose.y_m, pose.yaw_rad))
+    at = in_map(frame, pose)
     return Pose(x_m=at.x_m, y_m=at.y_m, z_m=frame.z_m + pose.z_m, yaw_rad=at.yaw_rad)
 
 

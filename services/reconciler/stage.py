@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.fences import FenceView
-from planning.frames import Planar
+from planning.frames import planar
 from planning.grid import GridSpec
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, Stage, StageSetup, StageSpec, Stamp, Topic
@@ -136,7 +136,7 @@ class ReconcilerStage:
         changed = told is not None and self._fences.update(told.message.version, told.message.fences)
         g = risk.grid
         spec = GridSpec(g.resolution_m, g.ix0, g.iy0, g.width, g.height)
-        shut = self._fences.shut(spec, Planar(frame.x_m, frame.y_m, frame.yaw_rad))
+        shut = self._fences.shut(spec, planar(frame))
         return fenced_ground(risk, shut, (pose.x_m, pose.y_m)), changed
 
     # --- safety -----------------------------------------------------------------------------------------------

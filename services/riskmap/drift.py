@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from planning.frames import Planar
+from planning.frames import Planar, planar
 from schemas.base import Pose
 
 _STANDS_M = 0.2
@@ -38,7 +38,7 @@ class Drift:
 
     def close(self, map_to_odom: Pose, robot: Pose) -> None:
         """Where `odom` lies in `map`: when that jumps, a loop was closed. robot: in `odom`."""
-        frame = Planar(map_to_odom.x_m, map_to_odom.y_m, map_to_odom.yaw_rad)
+        frame = planar(map_to_odom)
         if self._frame is not None and frame != self._frame:
             before, after = (f.apply(robot.x_m, robot.y_m) for f in (self._frame, frame))
             self._shown_m += math.dist(before, after)

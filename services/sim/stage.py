@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from planning.frames import Planar
+from planning.frames import Planar, planar
 from planning.grid import GridSpec
 from planning.randomness import stream
 from schemas.base import Pose
@@ -137,7 +137,7 @@ class SimStage:
             before = self._robot.state
             after = self._robot.step(self._command.speed_mps, self._command.turn_rate_radps, duration_s)
             self._distance_m += math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
-            self._slam.move(Planar(after.x_m, after.y_m, after.yaw_rad), after.z_m, drift)
+            self._slam.move(planar(after), after.z_m, drift)
             self._blocked |= after.blocked
 
     def closed_areas_m(self) -> tuple[tuple[float, float, float, float], ...]:

@@ -9,10 +9,10 @@ from typing import TypeVar
 
 import numpy as np
 
-from planning.frames import Planar
+from planning.frames import in_map, planar
 from planning.graph_mirror import FRONTIER, GraphMirror, RoadMap
 from planning.grid import GridSpec
-from schemas.base import Message, Pose
+from schemas.base import Message
 from schemas.contract import SECOND_NS
 from schemas.fences import Fences
 from schemas.operation import JudgeReport, LinkReport, MissionState, StageHealth
@@ -115,7 +115,7 @@ class StatusCore:
         seen.message, seen.received_ns, seen.count = message, now_ns, seen.count + 1
 
     def _follow(self, odometry: Odometry) -> None:
-        at = _in_map(odometry.map_to_odom, odometry.pose)
+        at = in_map(odometry.map_to_odom, odometry.pose)
         if self._trajectory and math.dist(self._trajectory[-1], at[:2]) < self.config.trajectory_spacing_m:
             return
         self._trajectory.append((at.x_m, at.y_m))
@@ -191,7 +191,7 @@ class StatusCore:
         odometry = self._latest("sim/odometry", Odometry)
         if odometry is None:
             return None
-        at = _in_map(odometry.map_to_odom, odometry.pose)
+        at = in_map(odometry.map_to_odom, odometry.pose)
         return PlaceReport(x_m=at.x_m, y_m=at.y_m, yaw_rad=at.yaw_rad)
 
     def _mission(self) -> MissionReport | None:
@@ -288,7 +288,7 @@ class StatusCore:
             canvas=self.canvas.whole(),
             trajectory=tuple(self._trajectory),
             robot=None if place is None else (place.x_m, place.y_m, place.yaw_rad),
-            plan=self._plan_in_map(),
+            plan=self._planin_map(),
             frontiers=tuple((float(x), float(y)) for x, y in frontiers),
             target=None if policy is None or policy.target < 0 else policy.target_xyz_m[:2],
             route=() if policy is None else tuple((float(x), float(y)) for x, y, _ in policy.route_xyz_m),
@@ -331,11 +331,11 @@ class StatusCore:
             events=tuple(self.events.events),
         )
 
-    def _plan_in_map(self) -> tuple[tuple[float, float], ...]:
+    def _planin_map(self) -> tuple[tuple[float, float], ...]:
         plan, odometry = self._latest("reconciler/plan", Plan), self._latest("sim/odometry", Odometry)
         if plan is None or odometry is None or not plan.valid:
             return ()
-        frame = _planar(odometry.map_to_odom)
+        frame = planar(odometry.map_to_odom)
         return tuple(frame.apply(float(x), float(y)) for x, y in zip(plan.x_m, plan.y_m, strict=True))
 
     def _title(self) -> str:
@@ -393,11 +393,3 @@ class StatusCore:
         if report.plan is not None:
             found |= {"plan_tau_seconds": report.plan.tau_s}
         return {name: value for name, value in found.items() if value is not None}
-
-
-def _planar(pose: Pose) -> Planar:
-    return Planar(pose.x_m, pose.y_m, pose.yaw_rad)
-
-
-def _in_map(map_to_odom: Pose, pose: Pose) -> Planar:
-    return _planar(map_to_odom).compose(_planar(pose))

@@ -17,11 +17,11 @@ from plgrim.deployment import ROLES, Role
 from plgrim.errors import NoRouterError
 from plgrim.runtime.router import router_settings
 from plgrim.runtime.zenoh_session import Link, connect
-from plgrim.security.access import OPERATOR, TOOLS, every_topic, root_of
+from plgrim.security.access import OPERATOR, TOOLS, every_topic
 from plgrim.security.certificates import Authority
 from plgrim.security.policy import clients_of, router_grants
 from schemas.base import Message
-from schemas.contract import Topic
+from schemas.contract import Topic, root_of
 from schemas.topics import INSTANCES, LINK, SUPERVISOR, health_topic
 from schemas.world import GraphRequest
 from tests.runtime.helpers import eventually
