@@ -55,13 +55,11 @@ class _World:
         self.odometry += 1
         self.version += 1
         self.graph_at_ms[self.version] = self.now_ms
-        moved = encode(odometry(now_ns, 0.0), Envelope("robot", "sim", 3, self.odometry, now_ns))
-        graph = encode(
-            global_irm(now_ns, self.version, self.version - 1),
-            Envelope("robot", "irm", 3, self.version, now_ns),
-        )
-        note_robot(self.seen, ODOMETRY, moved, (3, self.odometry), now_ns)
-        note_robot(self.seen, GLOBAL_IRM, graph, (3, self.version), now_ns)
+        graph = global_irm(now_ns, self.version, self.version - 1)
+        moved = Envelope("robot", "sim", 3, self.odometry, now_ns)
+        drawn = Envelope("robot", "irm", 3, self.version, now_ns)
+        note_robot(self.seen, ODOMETRY, odometry(now_ns, 0.0), moved, now_ns)
+        note_robot(self.seen, GLOBAL_IRM, graph, drawn, now_ns)
 
     def says(
         self,
