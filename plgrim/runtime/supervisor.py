@@ -79,7 +79,7 @@ class Supervisor:
             child.log.unlink(missing_ok=True)
         self.watch = Watch(run_folder / "pulse", services)
         self._clock_file = ClockFile(Path(self.config.runtime.state_dir))
-        self._clock = MissionClock.of(self.config.clock)
+        self._clock = MissionClock.of(self.config.clock, self.config.runtime.state_dir)
         environment = environment_of(run_folder / "config.yaml", None)
         with_spare = self.config.runtime.spare and command is plgrim_command
         self._spare = Spare(command, logs, environment) if with_spare else None
