@@ -29,6 +29,8 @@ from schemas.operation import LinkReport
 from schemas.topics import LINK, LINK_REPORT
 
 _TICK_S = 0.1
+_STEP_S = 0.5
+"""What the supervisor is told: a busy machine may make it late, a stopped one is found all the same."""
 
 
 def run_link(config: Config, stop: threading.Event) -> None:
@@ -80,6 +82,7 @@ class LinkProcess:
                 link.declare(topic)
                 link.subscribe(topic, self._from_standby, instance=STANDBY)
         self._service.mailbox_report = self._health_report
+        self._service.monitor.expect(_STEP_S)
         self._service.monitor.ready = True
         get_logger().info("ready", base=self._link_config.endpoint, at_base=list(self._link_config.at_base))
         for uplink in self._uplinks.values():

@@ -18,7 +18,7 @@ from schemas.contract import SECOND_NS, Stamp
 _BOOT = Path("/proc/sys/kernel/random/boot_id")
 _ANCHOR = "wall_clock"
 _AFTER_LAST_NS = 10 * SECOND_NS
-"""After a reboot the mission clock goes on at least so much after the newest snapshot, later than what was said then."""
+"""After a reboot the mission clock goes on at least so much after the newest snapshot, later than all that was said."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ import itertools
 
 import psutil
 import pytest
+import zenoh
 
 from plgrim.config import Config
 from plgrim.runtime.health import ask_health
@@ -59,7 +60,7 @@ def test_a_live_service_refuses_and_counts_them_all(
     warm, source = 0, bad_messages(COMMAND, "robot", 3, 2, 1)
     while sent < COUNT:
         for _, payload in itertools.islice(source, 400):
-            link.session.put(key, payload)
+            link.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
         sent += 400
         eventually(lambda: _count(link) == sent, f"all {sent} are counted")  # noqa: B023
         if sent == COUNT // 5:

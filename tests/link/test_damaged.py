@@ -7,7 +7,9 @@ import threading
 from collections.abc import Iterator
 
 import pytest
+from typer.testing import CliRunner
 
+from plgrim.cli import application
 from plgrim.config import Config, load_config
 from plgrim.link.process import run_link
 from plgrim.runtime.health import ask_health
@@ -73,6 +75,7 @@ def test_what_no_reader_would_take_does_not_cross_and_stops_nothing(link: Link, 
 
     eventually(lambda: ask_health(link, LINK), "the link process is there")
     eventually(crosses, "good messages cross")
+    assert CliRunner().invoke(application, ["healthcheck", LINK]).exit_code == 0
     refused = _counted(link, GLOBAL_IRM)
     sources = {topic.name: bad_messages(topic, "robot", 3, sequence, 1) for topic in topics}
     for sent in range(_BATCH, COUNT + 1, _BATCH):
@@ -100,11 +103,15 @@ def test_an_envelope_that_counts_is_one_that_was_checked(link: Link, base: Link)
     eventually(lambda: ask_health(link, LINK), "the link process is there")
     heard: list[int] = []
     base.subscribe(ODOMETRY, lambda t, p: heard.append(decode(p, t.message, t.max_bytes)[1].epoch))
-    link.session.put(ODOMETRY.key("robot"), bytes(payload))
-    eventually(lambda: _counted(link, ODOMETRY) == 1, "it is counted")
+    eventually(
+        lambda: _counted(link, ODOMETRY),
+        "it is counted",
+        doing=lambda: link.session.put(ODOMETRY.key("robot"), bytes(payload)),
+    )
+    sequences = itertools.count(1)
     eventually(
         lambda: heard,
         "later ones cross",
-        doing=lambda: link.session.put(ODOMETRY.key("robot"), good(ODOMETRY, "robot", 3, len(heard) + 1)),
+        doing=lambda: link.session.put(ODOMETRY.key("robot"), good(ODOMETRY, "robot", 3, next(sequences))),
     )
     assert heard[0] == 3
