@@ -45,6 +45,9 @@ from schemas.errors import MessageError
 from schemas.operation import StageHealth
 from schemas.topics import SERVICES, SUPERVISOR, health_topic
 
+_LONGEST_ROUND_S = 1.0
+"""Between two polls; more, and the supervisor was stopped, or starved."""
+
 __all__ = ["ROUTER", "Child", "Command", "Supervisor", "plgrim_command", "with_fresh_state"]
 
 
@@ -77,7 +80,8 @@ class Supervisor:
         self.children = {name: Child(name, logs / f"{name}.log") for name in (ROUTER, *services)}
         for child in self.children.values():
             child.log.unlink(missing_ok=True)
-        self.watch = Watch(run_folder / "pulse", services)
+        self.watch = Watch(run_folder / "pulse", (ROUTER, *services))
+        self._polled_s = time.monotonic()
         self._clock_file = ClockFile(Path(self.config.runtime.state_dir))
         self._clock = MissionClock.of(self.config.clock, self.config.runtime.state_dir)
         environment = environment_of(run_folder / "config.yaml", None)
@@ -147,13 +151,14 @@ class Supervisor:
         `runtime.hold_failed_s` after a service has FAILED.
         """
         now = time.monotonic()
+        self._excuse(now)
         for child in self.children.values():
             if child.process is None:
                 if child.restart_at_s is not None and now >= child.restart_at_s:
                     self._spawn(child)
             elif child.process.poll() is not None:
                 self._ended(child, now)
-            elif child.name != ROUTER:
+            else:
                 self._look_after(child, child.process, now)
         self._clock_file.write(self._clock.now_ns())
         if self._reporter is not None:
@@ -161,6 +166,16 @@ class Supervisor:
         if self._spare is not None and not self.waiting_for():
             self._spare.keep()
         self._give_up_if_held_long(now)
+
+    def _excuse(self, now: float) -> None:
+        """While the supervisor itself stood still it heard nobody: that is nobody's silence."""
+        missed_s, self._polled_s = now - self._polled_s - _LONGEST_ROUND_S, now
+        if missed_s <= 0.0:
+            return
+        with self._lock:
+            for child in self.children.values():
+                child.heard_s += missed_s
+                child.started_s += missed_s
 
     def _look_after(self, child: Child, process: subprocess.Popen[bytes], now: float) -> None:
         why = self._sick(child, process, now)
@@ -182,6 +197,8 @@ class Supervisor:
         return ""
 
     def _is_unheard(self, child: Child, now: float) -> bool:
+        if child.name == ROUTER:  # it says nothing on the wire
+            return False
         with self._lock:
             heard = child.health is not None and child.process and child.health.pid == child.process.pid
             since = child.heard_s if heard else child.started_s
@@ -189,7 +206,7 @@ class Supervisor:
         return now - since > (limit if heard else max(limit, self.config.runtime.start_timeout_s))
 
     def _spawn(self, child: Child) -> None:
-        pulse = new_pulse(self._folder / "pulse" / child.name) if child.name != ROUTER else None
+        pulse = new_pulse(self._folder / "pulse" / child.name)
         child.restart_at_s, child.ready_s = None, None
         child.started_s = time.monotonic()
         changes = {VARIABLE: str(pulse or "")}

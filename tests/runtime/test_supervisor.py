@@ -6,7 +6,9 @@ import json
 import os
 import signal
 import socket
+import subprocess
 import threading
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -151,6 +153,47 @@ def test_a_killed_router_comes_back_and_the_services_find_it(config: Config, tmp
 
         eventually(goes_on, "health comes through the new router", supervisor.poll)
         assert sim.restarted == 0
+
+
+def test_a_stopped_router_is_replaced_and_no_service_with_it(config: Config, tmp_path: Path) -> None:
+    with _supervisor(config, tmp_path) as supervisor:
+        supervisor.start()
+        supervisor.wait_ready(threading.Event())
+        router, sim = supervisor.children["router"], supervisor.children["sim"]
+        stopped = router.process
+        assert stopped is not None
+        eventually(
+            lambda: supervisor.watch.silent_s("router", stopped.pid) > 0, "its pulse is seen", supervisor.poll
+        )
+        os.kill(stopped.pid, signal.SIGSTOP)
+        eventually(lambda: router.process not in (None, stopped), "another router runs", supervisor.poll)
+        steps = sim.health.steps if sim.health else 0
+
+        def goes_on() -> bool:
+            return sim.health is not None and sim.health.steps > steps + 20
+
+        eventually(goes_on, "health comes through it", supervisor.poll)
+        assert sim.restarted == 0
+
+
+def test_a_supervisor_that_stood_still_blames_nobody(config: Config, tmp_path: Path) -> None:
+    """It was stopped (SIGSTOP, a machine that hung) for longer than any service may be silent."""
+    supervisor = _supervisor(config, tmp_path)
+    with subprocess.Popen(["sleep", "600"], start_new_session=True) as sleeper:
+        try:
+            child = supervisor.children["sim"]
+            child.process = sleeper
+            silent_s = config.runtime.start_timeout_s + 60.0
+            child.started_s = child.heard_s = supervisor._polled_s = time.monotonic() - silent_s
+            supervisor.poll()
+            assert sleeper.poll() is None
+            child.started_s = child.heard_s = time.monotonic() - silent_s
+            supervisor.poll()
+            assert sleeper.wait(10.0) == -signal.SIGKILL
+        finally:
+            sleeper.kill()
+            child.process = None
+            supervisor.__exit__(None)
 
 
 @pytest.mark.parametrize("behaviour", ["exits", "failing"])
