@@ -45,6 +45,10 @@ from schemas.errors import MessageError
 from schemas.operation import StageHealth
 from schemas.topics import SERVICES, SUPERVISOR, health_topic
 
+_LAST, _LAST_AFTER_S = "status", 10.0
+"""Started when all others are ready, or so much later: the robot drives without its page, and cores are few."""
+_SPARE_AFTER_S = 5.0
+"""A spare warms up when all have been ready for so long: not while their first plans need the cores."""
 _LONGEST_ROUND_S = 1.0
 """Between two polls; more, and the supervisor was stopped, or starved."""
 
@@ -82,6 +86,7 @@ class Supervisor:
             child.log.unlink(missing_ok=True)
         self.watch = Watch(run_folder / "pulse", (ROUTER, *services))
         self._polled_s = time.monotonic()
+        self._whole_s: float | None = None
         self._clock_file = ClockFile(Path(self.config.runtime.state_dir))
         self._clock = MissionClock.of(self.config.clock, self.config.runtime.state_dir)
         environment = environment_of(run_folder / "config.yaml", None)
@@ -103,6 +108,7 @@ class Supervisor:
         check_endpoint_free(self.config.router.endpoint)
         write_config(self.config, self._folder / "config.yaml")
         self._spawn(self.children[ROUTER])
+        self._start_services()  # now: they load their modules while the router opens
         try:
             self.link = connect(
                 self.config.router, self.config.robot, threading.Event(), 15.0, SUPERVISOR.writer
@@ -114,9 +120,16 @@ class Supervisor:
         for child in self._services():
             instance = self.config.link.instance(child.name)
             self.link.subscribe(health_topic(child.name), self._hear, instance=instance)
-            self._spawn(child)
         self.watch.start()
         return self.link
+
+    def _start_services(self) -> None:
+        later = _LAST if len(self._services()) > 1 else ""
+        for child in self._services():
+            if child.name == later:
+                child.restart_at_s = time.monotonic() + _LAST_AFTER_S
+            else:
+                self._spawn(child)
 
     def _services(self) -> list[Child]:
         return [child for child in self.children.values() if child.name != ROUTER]
@@ -152,9 +165,11 @@ class Supervisor:
         """
         now = time.monotonic()
         self._excuse(now)
+        waiting = self.waiting_for()
         for child in self.children.values():
             if child.process is None:
-                if child.restart_at_s is not None and now >= child.restart_at_s:
+                due = child.restart_at_s is not None and now >= child.restart_at_s
+                if due or (waiting == [_LAST] == [child.name] and not child.restarts and not child.failed):
                     self._spawn(child)
             elif child.process.poll() is not None:
                 self._ended(child, now)
@@ -163,7 +178,11 @@ class Supervisor:
         self._clock_file.write(self._clock.now_ns())
         if self._reporter is not None:
             self._reporter.tell(self.children, self.watch.flagged())
-        if self._spare is not None and not self.waiting_for():
+        if waiting:
+            self._whole_s = None
+        elif self._whole_s is None:
+            self._whole_s = now
+        if self._spare is not None and self._whole_s is not None and now - self._whole_s >= _SPARE_AFTER_S:
             self._spare.keep()
         self._give_up_if_held_long(now)
 

@@ -58,6 +58,23 @@ def test_all_become_ready_and_all_end(config: Config, tmp_path: Path) -> None:
     check_endpoint_free(config.router.endpoint)
 
 
+def test_the_page_starts_when_all_that_drives_is_ready(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot that resumes has two cores for nine processes; what it drives with has them first."""
+    monkeypatch.setattr("plgrim.runtime.supervisor._LAST_AFTER_S", 1e6)
+    services = ("status", "sim", "mission")
+    with Supervisor(config, tmp_path, services, fake_command({"status": "idle"})) as supervisor:
+        supervisor.start()
+        status, sim = supervisor.children["status"], supervisor.children["sim"]
+        assert status.process is None and sim.process is not None
+        assert supervisor.wait_ready(threading.Event())
+        assert sim.ready_s is not None and status.started_s >= sim.ready_s
+        assert status.process is not None
+        os.kill(status.process.pid, signal.SIGKILL)
+        eventually(lambda: status.restarted == 1 and status.ready, "it comes back like any other", supervisor.poll)
+
+
 def test_a_killed_service_comes_back(config: Config, tmp_path: Path) -> None:
     with _supervisor(config, tmp_path) as supervisor:
         supervisor.start()
