@@ -72,7 +72,9 @@ def test_the_page_starts_when_all_that_drives_is_ready(
         assert sim.ready_s is not None and status.started_s >= sim.ready_s
         assert status.process is not None
         os.kill(status.process.pid, signal.SIGKILL)
-        eventually(lambda: status.restarted == 1 and status.ready, "it comes back like any other", supervisor.poll)
+        eventually(
+            lambda: status.restarted == 1 and status.ready, "it comes back like any other", supervisor.poll
+        )
 
 
 def test_a_killed_service_comes_back(config: Config, tmp_path: Path) -> None:
