@@ -13,6 +13,7 @@ from services.riskmap.cells import (
     BELOW,
     CEILING,
     CEILING_SEEN,
+    HIT_LOW,
     HIT_WEIGHT,
     LOG_ODDS,
     MEAN,
@@ -264,6 +265,11 @@ def _fuse(cell: NDArray[np.float32], z: float, noise: float, points: float, rule
     # truly as low will be hit again, as an obstacle over this ground.
     if cell[CEILING_SEEN] > 0.0 and cell[CEILING] - z <= rules.height_m:
         cell[CEILING_SEEN] = 0.0
+    # And a roof over ground that falls away is taken for an obstacle on it, until the ground is seen.
+    if cell[HIT_WEIGHT] > 0.0 and cell[HIT_LOW] - z > rules.height_m + 3.0 * math.sqrt(noise):
+        cell[CEILING] = cell[HIT_LOW] if cell[CEILING_SEEN] == 0.0 else min(cell[HIT_LOW], cell[CEILING])
+        cell[CEILING_SEEN] += cell[HIT_WEIGHT]
+        cell[HIT_WEIGHT], cell[LOG_ODDS] = 0.0, 0.0
     if cell[HIT_WEIGHT] == 0.0:
         cell[LOG_ODDS] = max(cell[LOG_ODDS] - rules.pass_log_odds, -rules.hit_log_odds)
 
