@@ -75,7 +75,7 @@ def test_what_no_reader_would_take_does_not_cross_and_stops_nothing(link: Link, 
 
     eventually(lambda: ask_health(link, LINK), "the link process is there")
     eventually(crosses, "good messages cross")
-    assert CliRunner().invoke(application, ["healthcheck", LINK]).exit_code == 0
+    assert CliRunner().invoke(application, ["healthcheck", LINK, "--timeout", "20"]).exit_code == 0
     refused = _counted(link, GLOBAL_IRM)
     sources = {topic.name: bad_messages(topic, "robot", 3, sequence, 1) for topic in topics}
     for sent in range(_BATCH, COUNT + 1, _BATCH):
