@@ -67,7 +67,7 @@ def test_the_page_starts_when_all_that_drives_is_ready(
     with Supervisor(config, tmp_path, services, fake_command({"status": "idle"})) as supervisor:
         supervisor.start()
         status, sim = supervisor.children["status"], supervisor.children["sim"]
-        assert status.process is None and sim.process is not None
+        assert [child.process is None for child in (status, sim)] == [True, False]
         assert supervisor.wait_ready(threading.Event())
         assert sim.ready_s is not None and status.started_s >= sim.ready_s
         assert status.process is not None
