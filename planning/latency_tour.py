@@ -42,7 +42,9 @@ def latency_tour(leg: Floats, gain: Floats, weight: float) -> LatencyTour:
     """
     n = gain.shape[0]
     if not 1 <= n <= MOST_PLACES or leg.shape != (n + 1, n):
-        raise ValueError(f"1 to {MOST_PLACES} places with legs (n + 1, n) are wanted, got {n} and {leg.shape}")
+        raise ValueError(
+            f"1 to {MOST_PLACES} places with legs (n + 1, n) are wanted, got {n} and {leg.shape}"
+        )
     rest = np.zeros((1 << n, n))
     _solve(leg, gain, weight, rest)
     return LatencyTour(*_walk(leg, gain, weight, rest))

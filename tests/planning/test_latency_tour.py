@@ -29,7 +29,9 @@ def places(seed: int, count: int) -> tuple[Floats, Floats]:
     """Legs between random places with a few detours, which make them asymmetric, and gains."""
     rng = np.random.default_rng(seed)
     xy = rng.uniform(0, 50, (count + 1, 2))
-    leg = np.hypot(*(xy[:, None] - xy[None, :count]).transpose(2, 0, 1)) * rng.uniform(1, 2, (count + 1, count))
+    leg = np.hypot(*(xy[:, None] - xy[None, :count]).transpose(2, 0, 1)) * rng.uniform(
+        1, 2, (count + 1, count)
+    )
     return leg, rng.exponential(3.0, count)
 
 
