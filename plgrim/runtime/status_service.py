@@ -109,7 +109,9 @@ def _serve(
     server.start()
     service.monitor.expect(_TICK_S)
     service.monitor.ready = True
-    get_logger().info("ready", page=page_address(server.shared.config.host, server.port))
+    options = server.shared.config
+    page = page_address(options.host, server.port, secure=bool(options.tls_certificate_file))
+    get_logger().info("ready", page=page)
     while not stop.wait(_TICK_S):
         service.monitor.step_began()
         now = service.clock.now_ns()
