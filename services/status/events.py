@@ -77,7 +77,12 @@ class EventLog:
     _lost: bool = False
 
     def after(self, last_id: int) -> list[Event]:
-        """The events later than one, oldest first."""
+        """The events later than one, oldest first.
+
+        One that was never given is of another life of the service, whose numbers were lost: then all there are.
+        """
+        if last_id > self.last_id:
+            last_id = 0
         return [event for event in self.events if event.id > last_id]
 
     def observe(self, message: Message) -> None:
