@@ -89,14 +89,17 @@ export function Services({ status, sinceS }) {
     <tbody>${stages.map((stage) => {
       const [sign, words] = STATES[stage.state] ?? ["?", stage.state];
       const late = stage.age_s === null ? null : stage.age_s + sinceS;
+      const heard = stage.state === "ok" || stage.state === "not_ready"; // else its last figures are those of then
       const waiting = stage.waiting_for.length ? `waits for ${stage.waiting_for.join(", ")}` : "";
+      const more = [stage.last_error && `last error: ${stage.last_error}`, stage.degraded && `degraded: ${stage.degraded}`,
+        waiting].filter(Boolean);
       return html`<tr key=${stage.service} data-state=${stage.state}>
         <th scope="row">${stage.service}</th><td><span class="sign" aria-hidden="true">${sign}</span> ${words}</td>
-        <td class="number">${stage.rate_hz.toFixed(1)} Hz</td><td class="number wide">${stage.step_p50_ms.toFixed(1)} ms</td>
+        <td class="number">${heard ? `${stage.rate_hz.toFixed(1)} Hz` : "–"}</td>
+        <td class="number wide">${heard ? `${stage.step_p50_ms.toFixed(1)} ms` : "–"}</td>
         <td class="number">${age(late)}</td>
         <td class="number">${status.restarts?.[stage.service] ?? 0}</td></tr>
-        ${stage.last_error || waiting ? html`<tr class="more" key=${`${stage.service}-more`}><td colspan="6">${
-          stage.last_error ? `last error: ${stage.last_error}` : ""} ${waiting}</td></tr>` : null}`;
+        ${more.length ? html`<tr class="more" key=${`${stage.service}-more`}><td colspan="6">${more.join("; ")}</td></tr>` : null}`;
     })}</tbody></table></div>`;
 }
 
