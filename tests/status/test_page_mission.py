@@ -40,8 +40,11 @@ def page(shared: SharedStatus, behind: MissionBehind) -> Iterator[Any]:
     try:
         with chromium() as browser:
             page = browser.new_page(viewport={"width": 1280, "height": 800})
+            said: list[str] = []
+            page.on("console", lambda m: said.append(m.text) if m.type in ("error", "warning") else None)
             page.goto(f"http://127.0.0.1:{server.port}/#token={TOKEN}")
             until(page, "plgrim.store.get('status')?.mission != null")
+            assert said == [], "no complaint of the address that is printed"
             yield page
     finally:
         server.stop()

@@ -149,7 +149,7 @@ function Bar({ status }) {
 
 async function readToken() {
   const token = await new Promise((resolve) => app.askToken("Reading needs a token here.", resolve));
-  if (token && (await api.openSession(token)).ok) app.link.reconnect();
+  if (token && (await api.openSession(token)).ok) app.link.retry();
 }
 
 function useTools(setAnswer) {
@@ -231,5 +231,5 @@ render(html`<${Page} />`, Object.assign(document.getElementById("app"), { textCo
 const given = /^#token=(.+)$/.exec(location.hash)?.[1];
 if (given) {
   history.replaceState(null, "", location.pathname + location.search);
-  if ((await api.openSession(decodeURIComponent(given))).ok) app.link.reconnect();
+  if ((await api.openSession(decodeURIComponent(given))).ok) app.link.retry();
 }
