@@ -50,9 +50,10 @@ class CoverageModel(NamedTuple):
 
     step_to: (n, 8), the neighbour in each direction, -1 outside. top: (n,), lattice row of the footprint's first row.
     edge_distance_m, edge_risk, edge_discount: (n, 8). entropy: (n,), nats of whole patches. footprint: (n, 8, rows),
-    the nodes that the sensor covers from a node under a heading, shifted to lattice columns. leaf_value: (n,).
-    particle_*: (p,), the root belief. covered: (size,) bits that count as covered already. row_low, row_high: (n,),
-    the rows of the footprint that are not empty, half open. cluster_*: groups of uncovered nodes for the informed
+    the nodes not covered at the root that the sensor covers from a node under a heading, shifted to lattice columns.
+    leaf_value: (n,). particle_*: (p,), the root belief. covered: (size,) bits that count as covered already: whatever
+    is asked of the model is asked with these covered, or more. row_low, row_high: (n, 8), the rows of the footprint
+    that are not empty, half open. cluster_*: groups of uncovered nodes for the informed
     rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_rows (c, 3) words, cluster_top (c,) first row.
     looks_on_turn: whether turning shows something new: not to a sensor that looks all around. It has looked from where
     the robot stands; what the model still promises there would be seen from the node's anchor.
@@ -70,8 +71,8 @@ class CoverageModel(NamedTuple):
     edge_risk: NDArray[np.float32]
     edge_discount: NDArray[np.float64]
     entropy: NDArray[np.float64]
-    row_low: NDArray[np.int32]
-    row_high: NDArray[np.int32]
+    row_low: NDArray[np.int8]
+    row_high: NDArray[np.int8]
     footprint: NDArray[np.uint64]
     leaf_value: NDArray[np.float64]
     particle_node: NDArray[np.int32]
@@ -106,8 +107,8 @@ def wedge_rows(reach: int, fov_rad: float) -> NDArray[np.uint32]:
 @njit_borrowing
 def new_nodes(
     footprint: NDArray[np.uint64],
-    row_low: NDArray[np.int32],
-    row_high: NDArray[np.int32],
+    row_low: NDArray[np.int8],
+    row_high: NDArray[np.int8],
     top: int,
     node: int,
     heading: int,
@@ -115,7 +116,7 @@ def new_nodes(
 ) -> int:
     """How many nodes one look from (node, heading) would newly cover; top: lattice row of the footprint's row 0."""
     total = 0
-    for r in range(row_low[node], row_high[node]):
+    for r in range(row_low[node, heading], row_high[node, heading]):
         total += count_bits(footprint[node, heading, r] & ~covered[top + r])
     return total
 
@@ -149,8 +150,8 @@ def look_on_turn(
 @njit_borrowing
 def _look(
     footprint: NDArray[np.uint64],
-    row_low: NDArray[np.int32],
-    row_high: NDArray[np.int32],
+    row_low: NDArray[np.int8],
+    row_high: NDArray[np.int8],
     entropy: NDArray[np.float64],
     size: int,
     top: int,
@@ -159,7 +160,7 @@ def _look(
     covered: NDArray[np.uint64],
 ) -> float:
     information = 0.0
-    for r in range(row_low[node], row_high[node]):
+    for r in range(row_low[node, heading], row_high[node, heading]):
         row = top + r
         fresh = footprint[node, heading, r] & ~covered[row]
         if fresh == np.uint64(0):
@@ -628,36 +629,33 @@ def clusters(
 
 
 @njit
-def _row_bounds(
-    visible: NDArray[np.uint32], size: int, reach: int, low: NDArray[np.int32], high: NDArray[np.int32]
-) -> None:
-    """The rows of each node that lie in the lattice and are not empty, half open."""
-    for node in range(size * size):
-        low[node] = high[node] = 0
-        first = True
-        for r in range(2 * reach + 1):
-            row = node // size - reach + r
-            if 0 <= row < size and visible[node, r] != 0:
-                low[node] = r if first else low[node]
-                high[node] = r + 1
-                first = False
-
-
-@njit
 def _footprints(
     visible: NDArray[np.uint32],
     wedge: NDArray[np.uint32],
-    size: int,
+    covered: NDArray[np.uint64],
     reach: int,
     footprint: NDArray[np.uint64],
+    low: NDArray[np.int8],
+    high: NDArray[np.int8],
 ) -> None:
-    """What is visible and in the field of view, by node and heading, shifted to lattice columns; (n, 8, rows) out."""
+    """What is visible, in the field of view and not covered, by node and heading: columns `CoverageModel` has, out.
+
+    Most rows around a robot that has looked about are empty: that they are skipped is half of the speed.
+    """
+    size = covered.shape[0]
     for node in range(size * size):
         shift = node % size - reach
         for k in range(8):
+            low[node, k] = high[node, k] = 0
             for r in range(2 * reach + 1):
+                row = node // size - reach + r
                 word = np.uint64(visible[node, r] & wedge[k, r])
-                footprint[node, k, r] = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
+                word = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
+                word = word & ~covered[row] if 0 <= row < size else np.uint64(0)
+                footprint[node, k, r] = word
+                if word != np.uint64(0):
+                    low[node, k] = r if high[node, k] == 0 else low[node, k]
+                    high[node, k] = r + 1
 
 
 @njit
@@ -747,14 +745,13 @@ def build_model(
     # Copies: arrays of a decoded message are read-only, which is another type to the compiler and a second compilation.
     distance, risk, seen = np.array(edge_distance_m), np.array(edge_risk), np.array(visible)
     move, cost, rows, top = clusters(entropy, size, reach, seen, distance, risk, risk_weight_m, start)
-    low, high = np.zeros(size * size, np.int32), np.zeros(size * size, np.int32)
-    _row_bounds(seen, size, reach, low, high)
     step_to, top_row = (
         lattice_steps(size),
         (np.arange(size * size, dtype=np.int32) // size - reach).astype(np.int32),
     )
     footprint = np.zeros((size * size, 8, 2 * reach + 1), np.uint64)
-    _footprints(seen, wedge_rows(reach, fov_rad), size, reach, footprint)
+    low, high = np.zeros((size * size, 8), np.int8), np.zeros((size * size, 8), np.int8)
+    _footprints(seen, wedge_rows(reach, fov_rad), np.array(root.covered), reach, footprint, low, high)
     looked = fov_rad >= _FULL_TURN and bool(
         _has_looked(footprint, top_row, np.array(root.node), np.array(root.covered))
     )

@@ -9,6 +9,9 @@ import typer
 
 from plgrim.commands.options import ConfigFile, OutFolder
 
+_MUCH_DRIFT_DEG = 3.0
+"""More than this per 10 m, and the risk map's window holds no map of one place any more."""
+
 
 def feed(
     file: Annotated[Path, typer.Argument(help="Pose graph (.g2o), .mcap, ROS 1 .bag, or rosbag2 folder.")],
@@ -61,6 +64,14 @@ def feed(
         console.print(f"{key}: {result[key]:g}", highlight=False)
     for reason, count in result["left_out"].items():
         console.print(f"left out: {count} {reason}", highlight=False)
+    drift_deg = result["odometry_drift_deg_per_10_m"]
+    if drift_deg > _MUCH_DRIFT_DEG:
+        console.print(
+            f"odometry turns by {drift_deg:g} degrees per 10 m against the corrected poses: ground that is seen "
+            "again lies in several places; --corrected takes the corrected poses as odometry too",
+            style="yellow",
+            highlight=False,
+        )
     console.print(f"result in {out}/: result.json, map.png, area.png, coverage.png", highlight=False)
 
 

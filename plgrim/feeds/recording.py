@@ -19,6 +19,7 @@ CLEARANCE_M = 1.0
 _SPEED_MPS, _TURN_RADPS = 1.0, 1.5
 _LONGEST_STRIDE_M = 0.5
 _SHORTEST_S = 0.1
+_DRIFT_OVER_M = 10.0
 
 
 class Moment(NamedTuple):
@@ -58,6 +59,19 @@ class Recording:
     def end_ns(self) -> Stamp:
         """Stamp of the last moment."""
         return self.moments[-1].stamp_ns
+
+    @property
+    def odometry_drift_rad(self) -> float:
+        """How much odometry turns against `map` over 10 m driven: mean of such stretches, rad; 0: none."""
+        turns: list[float] = []
+        driven_m, turned = 0.0, wrap_angle(self.moments[0].odom.yaw_rad - self.moments[0].map.yaw_rad)
+        for a, b in zip(self.moments[:-1], self.moments[1:], strict=True):
+            driven_m += 0.0 if b.jumped else math.dist(a.map[:2], b.map[:2])
+            if driven_m >= _DRIFT_OVER_M:
+                now = wrap_angle(b.odom.yaw_rad - b.map.yaw_rad)
+                turns.append(abs(wrap_angle(now - turned)))
+                driven_m, turned = 0.0, now
+        return sum(turns) / len(turns) if turns else 0.0
 
 
 def of_poses(name: str, pose: NDArray[np.float64], gap: NDArray[np.bool_]) -> Recording:

@@ -136,6 +136,7 @@ def _write(
         "keyframes": len(feed.keyframes),
         "distance_m": round(recording.length_m, 2),
         "duration_s": recording.end_ns / SECOND_NS,
+        "odometry_drift_deg_per_10_m": round(math.degrees(recording.odometry_drift_rad), 2),
         "breadcrumbs": len(crumbs),
         "frontiers": len(frontiers),
         "given_up": dict(sorted(Counter(last.unreachable_reason).items())) if last else {},

@@ -13,6 +13,7 @@ from services.riskmap.cells import (
     BELOW,
     CEILING,
     CEILING_SEEN,
+    HIT_LOW,
     HIT_WEIGHT,
     LOG_ODDS,
     MEAN,
@@ -118,6 +119,16 @@ def upright(sweep: Sweep, step_m: float, height_m: float) -> NDArray[np.bool_]:
 
 
 @njit
+def _lowest_beyond(sweep: Sweep, b: int, steepest: NDArray[np.float32]) -> None:
+    """Into (bins,): rise per metre of the lowest ray of a bearing that ends beyond each bin; inf: none does."""
+    lowest = np.float32(np.inf)
+    for k in range(steepest.size - 1, -1, -1):
+        steepest[k] = lowest
+        if sweep.low[b, k] < np.inf:
+            lowest = min(lowest, (sweep.low[b, k] - np.float32(sweep.sensor[2])) / sweep.low_distance[b, k])
+
+
+@njit
 def walk(
     sweep: Sweep, body: NDArray[np.bool_], cells: NDArray[np.float32], rules: GroundRules
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -125,8 +136,10 @@ def walk(
 
     The lowest point of a bin is ground unless it rises too steeply from the last ground of its bearing, stands well
     above the ground that the cell is known to have, or is the middle of something upright. Ground may fall as it
-    likes. So crowns, overhangs and decks above the robot are not ground, as long as ground below them leads there.
+    likes. So crowns, overhangs and decks above the robot are not ground, as long as ground below them leads there, nor
+    is anything below which a ray has passed, in this sweep or before: a roof that comes down is no ground that rises.
     """
+    steepest = np.empty(sweep.low.shape[1], dtype=np.float32)
     kind = np.zeros(sweep.low.shape, dtype=np.uint8)
     ground = np.zeros(sweep.low.shape, dtype=np.float32)
     for b in range(BEARINGS):
@@ -134,6 +147,7 @@ def walk(
             continue
         angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
         dx, dy = math.cos(angle), math.sin(angle)
+        _lowest_beyond(sweep, b, steepest)
         last_z, last_r = rules.feet_m, 0.0
         trend = rules.lean_x * dx + rules.lean_y * dy
         for k in range(sweep.low.shape[1]):
@@ -143,12 +157,17 @@ def walk(
             r = sweep.low_distance[b, k]
             row, column = slot(rules, cells.shape[0], cells.shape[1], sweep.sensor[0] + r * dx, sweep.sensor[1] + r * dy)  # fmt: skip  # noqa: E501
             known, mean, gap = False, np.float32(0.0), r - last_r
+            bound = sweep.sensor[2] + steepest[k] * r + BOUND_TOLERANCE_M + 3.0 * rules.angle_sigma_rad * r
             if row >= 0:
                 # Much lower than what leads there it is the ground of another storey, unless a slope may lie between.
                 mean = cells[row, column, MEAN]
                 lower = rules.height_m + _STEEP * gap
                 known = cells[row, column, SEEN] >= _TRUSTED_POINTS and mean > last_z - lower
-            if known:
+                if cells[row, column, SEEN] == BELOW:
+                    bound = min(bound, mean + rules.step_m)
+            if z > bound:
+                is_ground = False
+            elif known:
                 drift = rules.drift_per_m * (rules.travelled_m - cells[row, column, TRAVELLED])
                 gate = max(rules.step_m, 3.0 * math.sqrt(cells[row, column, VARIANCE] + drift * drift))
                 is_ground = z <= mean + gate
@@ -246,6 +265,11 @@ def _fuse(cell: NDArray[np.float32], z: float, noise: float, points: float, rule
     # truly as low will be hit again, as an obstacle over this ground.
     if cell[CEILING_SEEN] > 0.0 and cell[CEILING] - z <= rules.height_m:
         cell[CEILING_SEEN] = 0.0
+    # And a roof over ground that falls away is taken for an obstacle on it, until the ground is seen.
+    if cell[HIT_WEIGHT] > 0.0 and cell[HIT_LOW] - z > rules.height_m + 3.0 * math.sqrt(noise):
+        cell[CEILING] = cell[HIT_LOW] if cell[CEILING_SEEN] == 0.0 else min(cell[HIT_LOW], cell[CEILING])
+        cell[CEILING_SEEN] += cell[HIT_WEIGHT]
+        cell[HIT_WEIGHT], cell[LOG_ODDS] = 0.0, 0.0
     if cell[HIT_WEIGHT] == 0.0:
         cell[LOG_ODDS] = max(cell[LOG_ODDS] - rules.pass_log_odds, -rules.hit_log_odds)
 

@@ -218,6 +218,41 @@ def test_ground_once_seen_is_not_taken_for_overhead_when_what_leads_there_is_mis
     assert at(model, layers_of(model, Pose()).state, 8.05, 0.1) == FREE
 
 
+@pytest.mark.parametrize("in_one_sweep", [True, False])
+def test_a_roof_below_which_a_ray_has_passed_is_not_taken_for_ground_that_rises(in_one_sweep: bool) -> None:
+    """The roof of a neck, 1.3 m over its floor, is the first that a level ray meets after a gap between the rings."""
+    near = [(x, 0.0) for x in np.arange(0.9, 2.8, 0.3)]
+    roof, beyond = (7.15, 1.3), (9.35, 0.1 if in_one_sweep else -1.3)
+    sweeps = [[*near, roof, beyond]] if in_one_sweep else [[*near, beyond], [*near, roof]]
+    y = np.arange(-0.3, 0.31, 0.01)
+    model = TerrainModel(config(profile="spot"))
+    for k, sweep in enumerate(sweeps):
+        points = [np.stack([0.0 * y + x, y * x / 9.0, 0.0 * y + z], axis=1) for x, z in sweep]
+        model.integrate(sparse_cloud(np.concatenate(points), k + 1))
+    assert at(model, cells_of(model)[SEEN], 7.15, 0.05) <= 0
+    assert at(model, cells_of(model)[MEAN], 7.15, 0.05) < 0.6
+    assert at(model, cells_of(model)[SEEN], 9.35, 0.05) > 0, "what lies beyond is ground"
+
+
+def test_a_roof_over_ground_that_falls_away_is_no_obstacle_once_the_ground_is_seen() -> None:
+    """From the crest, what hangs low over the slope behind it stands in the way, until the floor is seen."""
+    y = np.arange(-0.3, 0.31, 0.01)
+
+    def rows(*places: tuple[float, float]) -> NDArray[np.float64]:
+        return np.concatenate([np.stack([0.0 * y + x, y * x / 9.0, 0.0 * y + z], axis=1) for x, z in places])
+
+    crest = [(x, 0.0) for x in np.arange(0.9, 7.0, 0.25)]
+    model = TerrainModel(config(profile="spot"))
+    for k in range(3):
+        model.integrate(sparse_cloud(rows(*crest, (7.15, 0.7)), k + 1))
+    assert at(model, cells_of(model)[LOG_ODDS], 7.15, 0.05) > 0
+    model.integrate(sparse_cloud(rows(*crest[:-2], (7.15, -1.0)), 4))
+    cells = cells_of(model)
+    assert at(model, cells[LOG_ODDS], 7.15, 0.05) <= 0
+    assert at(model, cells[CEILING_SEEN], 7.15, 0.05) > 0
+    assert at(model, cells[CEILING], 7.15, 0.05) == pytest.approx(0.7, abs=0.01)
+
+
 def test_a_ceiling_seen_over_a_crest_is_not_taken_for_the_ground_that_lies_below() -> None:
     """From the upper end of a slope, rays pass over its lower part and meet the ceiling beyond: z = 1 over -1.2."""
     y = np.arange(-0.5, 0.5, 0.05)

@@ -17,14 +17,14 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from planning.frames import Planar
+from planning.frames import Planar, wrap_angle
 from plgrim.config import load_config
 from plgrim.feeds.bag import BagOptions, read_bag
 from plgrim.feeds.errors import FeedError, StackedFloorsError
 from plgrim.feeds.g2o import read_g2o
 from plgrim.feeds.laser import scan_cloud
 from plgrim.feeds.picture import Canvas
-from plgrim.feeds.recording import of_poses
+from plgrim.feeds.recording import Moment, Recording, of_poses
 from plgrim.feeds.run import play, read_pose_graph, read_recording
 from plgrim.feeds.stage import FeedStage, driven_ground
 from schemas.base import Message
@@ -301,6 +301,19 @@ def test_a_recording_is_read_in_both_frames(tmp_path: Path) -> None:
     told = [o.message for k in range(400) for o in feed.step(k * SECOND_NS // 20, Inputs({}))]
     frames = {round(m.map_to_odom.x_m, 6) for m in told if isinstance(m, Odometry)}
     assert frames == {round(0.02 * k, 6) for k in range(30)}
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, -8.0])
+def test_the_turn_of_odometry_is_told_per_ten_metres_and_across_the_half_turn(turn_deg: float) -> None:
+    """The building turns with odometry; a corrected heading near pi must not be read as a whole turn."""
+    moments = []
+    for k in range(101):
+        yaw = math.pi - 0.01 + 0.02 * (k % 2)
+        odom = Planar(0.5 * k, 0.0, wrap_angle(yaw + math.radians(turn_deg) * 0.05 * k))
+        moments.append(Moment(k, odom, Planar(0.5 * k, 0.0, wrap_angle(yaw)), 0.0, None, None, False))
+    drift_rad = Recording("turning", moments).odometry_drift_rad
+    assert math.degrees(drift_rad) == pytest.approx(abs(turn_deg), abs=1e-6)
+    assert Recording("short", moments[:15]).odometry_drift_rad == 0.0
 
 
 def test_a_missing_topic_or_another_type_is_refused_with_what_is_there(tmp_path: Path) -> None:
