@@ -102,8 +102,8 @@ class Seen:
                 self.coverage = message.coverage
             case Odometry():
                 self.in_odom.append((now / SECOND_NS, message.pose.x_m, message.pose.y_m))
-                at = in_map(message.map_to_odom, message.pose)
-                self.in_map.append((now / SECOND_NS, at.x_m, at.y_m))
+                place = in_map(message.map_to_odom, message.pose)
+                self.in_map.append((now / SECOND_NS, place.x_m, place.y_m))
             case CommandAnswer():
                 self.answers.append(message)
             case MissionState():
