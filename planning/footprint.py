@@ -132,8 +132,28 @@ def footprint_hazard(
     weights = disc_weights(kernel_radius_m(radius_m, resolution_m), resolution_m)
     if weights.size == 1:
         return hazard_per_m.astype(np.float32)
-    result: NDArray[np.float32] = ndimage.convolve(hazard_per_m.astype(np.float32), weights, mode="nearest")
-    return np.maximum(result, np.float32(0.0))
+    padded = np.pad(hazard_per_m.astype(np.float32), weights.shape[0] // 2, mode="edge")
+    result = np.empty(hazard_per_m.shape, np.float32)
+    _correlate(padded, weights, result)
+    return result
+
+
+@njit
+def _correlate(padded: NDArray[np.float32], weights: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+    """Correlation with the (symmetric) weights, row by row: a sum of shifted rows takes several columns at a time."""
+    size, width = weights.shape[0], out.shape[1]
+    total = np.empty(width, np.float32)
+    for row in range(out.shape[0]):
+        total[:] = np.float32(0.0)
+        for i in range(size):
+            for j in range(size):
+                weight = weights[i, j]
+                if weight == np.float32(0.0):
+                    continue
+                for column in range(width):
+                    total[column] += weight * padded[row + i, column + j]
+        for column in range(width):
+            out[row, column] = total[column]
 
 
 @njit_borrowing

@@ -54,7 +54,7 @@ def status_address(config: Config) -> tuple[str, int]:
 
 def status_page(config: Config) -> str:
     """Address of the status page as a person on this host opens it."""
-    return page_address(*status_address(config))
+    return page_address(*status_address(config), secure=bool(config.status.get("tls_certificate_file")))
 
 
 def attach_recorder(link: Link, recorder: MissionRecorder) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from schemas.topics import SERVICES
 from services.sim.worlds import WORLD_NAMES
 from services.status.app import SharedStatus, create_app
 from services.status.config import Config as StatusConfig
+from services.status.geojson import FenceRequest
 
 ROOT = Path(__file__).resolve().parent.parent
 _SKIPPED = {"node_modules", "build", "dist", "out", "results"}
@@ -131,3 +133,12 @@ def test_every_link_within_the_project_leads_somewhere(path: Path) -> None:
 def test_every_room_has_a_readme() -> None:
     rooms = ["schemas", "planning", "plgrim", *(f"services/{name}" for name in SERVICES)]
     assert [room for room in rooms if not (ROOT / room / "README.md").is_file()] == []
+
+
+def test_the_polygon_of_the_walk_is_one_and_says_its_frame() -> None:
+    file = json.loads((ROOT / "examples" / "corner.geojson").read_text(encoding="utf-8"))
+    assert "plgrim nogo examples/corner.geojson" in README
+    (fence,) = FenceRequest.model_validate(
+        {"kind": "no_go", "frame": file["frame"], "geojson": file}
+    ).fences()
+    assert len(fence.rings[0].points) == 5

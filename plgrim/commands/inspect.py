@@ -7,8 +7,8 @@ import os
 import sys
 import threading
 import urllib.error
-import urllib.request
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -20,18 +20,27 @@ if TYPE_CHECKING:
 
 def status(
     url: Annotated[str | None, typer.Option(help="Of the status service, as http://127.0.0.1:8080.")] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(help="File with a token, where reading needs one; default: status.tokens_file."),
+    ] = None,
     config_file: ConfigFile = None,
 ) -> None:
     """Print the status of a running mission as JSON."""
     from plgrim.config import load_config
     from plgrim.errors import PlgrimError
     from plgrim.missions import status_page
+    from plgrim.status_client import get_json, own_secret, secret_of, tls_context
 
     if url is not None and not url.startswith(("http://", "https://")):
         raise typer.BadParameter(f"--url: {url!r} is no address: give one as http://127.0.0.1:8080")
-    address = (url or status_page(load_config(config_file))).rstrip("/")
+    config = load_config(config_file)
+    address = (url or status_page(config)).rstrip("/")
     try:
-        answer = json.dumps(_get(f"{address}/api/v1/status"), indent=2)
+        # A token of this host's own service goes to no other address.
+        secret = secret_of(token_file) if token_file else "" if url else own_secret(config)
+        context = None if url else tls_context(config)
+        answer = json.dumps(get_json(f"{address}/api/v1/status", context, secret), indent=2)
     except (OSError, ValueError) as error:
         raise PlgrimError(
             f"no status at {address}: {error}; is the mission running (`plgrim up`)?"
@@ -45,11 +54,6 @@ def _print(text: str) -> None:
         print(text, flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains when it ends
-
-
-def _get(address: str) -> Any:
-    with urllib.request.urlopen(address, timeout=5.0) as response:
-        return json.load(response)
 
 
 def healthcheck(
@@ -75,11 +79,14 @@ def healthcheck(
 
 def _status_trouble(config: Config) -> str:
     from plgrim.missions import status_page
+    from plgrim.status_client import StatusRefusedError, get_json, tls_context
 
     try:
-        _get(f"{status_page(config)}healthz")
+        get_json(f"{status_page(config)}healthz", tls_context(config))
     except urllib.error.HTTPError as error:
         return f"answers {error.code}"
+    except StatusRefusedError as error:
+        return str(error)
     return ""
 
 

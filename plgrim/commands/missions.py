@@ -209,6 +209,7 @@ def _finish(result: dict[str, Any], out: Path) -> None:
     console.print(summary_table(result))
     console.print(stage_table(result))
     console.print(f"result in {out}/: result.json, trajectory.csv, coverage.png, map.png", highlight=False)
+    console.print(f"as one page: plgrim report {out}", highlight=False)
     sys.exit(0 if result["succeeded"] else 1)
 
 

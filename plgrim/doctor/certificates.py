@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 from plgrim.doctor.finding import Finding
@@ -21,6 +22,19 @@ def certificates(folder: Path) -> list[Finding]:
     findings = [finding for place in found for finding in _of(place, folder)]
     bad = [finding for finding in findings if finding.level != "ok"]
     return bad or [Finding("certificates", "ok", f"{len(found)} in {folder}, keys private, none ends soon")]
+
+
+def page_certificate(file: Path, key: Path) -> list[Finding]:
+    """Of the status page's HTTPS: the certificate's dates, and that others cannot read its key."""
+    name = "page certificate"
+    renew = "issue it anew, or correct status.tls_certificate_file and status.tls_key_file"
+    found = [replace(one, mend=one.mend and renew) for one in [_expiry(name, file)]]
+    if not key.is_file():
+        found.append(Finding(name, "error", f"status.tls_key_file: {key} is missing", renew))
+    elif key.stat().st_mode & 0o077:
+        mode = oct(key.stat().st_mode & 0o777)[2:]
+        found.append(Finding(name, "error", f"others may read {key} (mode {mode})", f"chmod 600 {key}"))
+    return found
 
 
 def _of(place: Path, folder: Path) -> list[Finding]:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import urllib.error
-import urllib.request
 from pathlib import Path
 
 from plgrim.config import Config
 from plgrim.doctor import machine
-from plgrim.doctor.certificates import certificates
+from plgrim.doctor.certificates import certificates, page_certificate
 from plgrim.doctor.finding import Finding
 from plgrim.doctor.system import system
+from plgrim.errors import PlgrimError
 from plgrim.hosts import host_and_port
 from plgrim.missions import status_address, status_page
+from plgrim.status_client import get_json, tls_context
 
 
 def examine(config: Config, listen_s: float) -> list[Finding]:
@@ -41,14 +41,15 @@ def examine(config: Config, listen_s: float) -> list[Finding]:
         found.append(
             Finding("certificates", "error", "the endpoint wants TLS, and none are configured", mend)
         )
+    page_file = str(config.status.get("tls_certificate_file") or "")
+    if page_file:
+        found += page_certificate(Path(page_file), Path(str(config.status.get("tls_key_file") or "")))
     return [*found, *heard]
 
 
 def _page_answers(config: Config) -> bool:
     try:
-        with urllib.request.urlopen(f"{status_page(config)}healthz", timeout=1.0) as answer:
-            return bool(answer.status == 200)
-    except urllib.error.HTTPError as error:
-        return "plgrim" in error.headers.get("server", "").lower()
-    except (OSError, ValueError):
+        answer = get_json(f"{status_page(config)}healthz", tls_context(config))
+    except (PlgrimError, OSError, ValueError):
         return False
+    return bool(answer == {"status": "ok"})

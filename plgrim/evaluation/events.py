@@ -11,6 +11,7 @@ from schemas.contract import SECOND_NS, Stamp
 from schemas.operation import JudgeReport, MissionState, StageHealth
 from schemas.policy import GlobalPolicy, Plan, SafetyState
 from schemas.world import CoverageSummary
+from services.status.events import SAFETY_WORDS
 
 _MOST = 2000
 _QUIET = frozenset({SafetyState.RUN, SafetyState.DONE, SafetyState.RETURN})
@@ -83,7 +84,8 @@ class EventLog:
             return
         before, self._safety = self._safety, m.safety
         if m.safety not in _QUIET or before not in _QUIET:
-            self._add(now, "safety", f"{m.safety.value}: {m.reason}")
+            why = f": {m.reason}" if m.reason and m.safety is not SafetyState.RUN else ""
+            self._add(now, "safety", SAFETY_WORDS[m.safety.value] + why)
 
     def _coverage(self, m: CoverageSummary, now: Stamp) -> None:
         places = zip(m.unreachable_xy_m.tolist(), m.unreachable_reason, strict=False)

@@ -49,11 +49,12 @@ def check_endpoint_free(endpoint: str) -> None:
         )
 
 
-def page_address(host: str, port: int) -> str:
-    """Address of the page as a person on this host opens it, wherever it listens."""
+def page_address(host: str, port: int, secure: bool = False) -> str:
+    """Address of the page as a person on this host opens it, wherever it listens. secure: it serves HTTPS."""
     if host in ("0.0.0.0", "::"):
         host = "127.0.0.1"
-    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+    place = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+    return f"{'https' if secure else 'http'}://{place}/"
 
 
 def router_settings(config: Config) -> dict[str, Any]:

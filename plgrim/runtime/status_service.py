@@ -16,7 +16,7 @@ from plgrim.runtime.service import LiveService
 from plgrim.security.access import COMMAND_QUERY
 from schemas.base import Message
 from schemas.contract import Output, Topic, root_of
-from schemas.topics import COMMAND, STATUS_GRAPH_REQUEST, read_by
+from schemas.topics import COMMAND, LINK, STATUS_GRAPH_REQUEST, read_by, topic_named
 from services.status import app
 from services.status.commands import answer_json
 from services.status.config import Config as StatusConfig
@@ -33,7 +33,11 @@ def command_key(robot: str) -> str:
 class StatusFeed:
     """Takes payloads of any topic of the status, refuses as every mailbox does, and shows the rest to the core."""
 
-    def __init__(self, robot: str, shared: app.SharedStatus, clock: MissionClock) -> None:
+    def __init__(
+        self, robot: str, shared: app.SharedStatus, clock: MissionClock, with_link: bool = True
+    ) -> None:
+        """with_link: there is a link to another host, which is to report."""
+        self._with_link = with_link
         self._mailbox = Mailbox(robot, tuple(read_by("status")))
         self._shared = shared
         self._clock = clock
@@ -56,7 +60,11 @@ class StatusFeed:
     def report(self, now: int) -> tuple[dict[str, int], list[str]]:
         """For health: what was refused, and what is missing."""
         with self._lock:
-            return dict(self._mailbox.dropped), self._mailbox.missing(now)
+            missing = self._mailbox.missing(now)
+            dropped = dict(self._mailbox.dropped)
+        if not self._with_link:
+            missing = [name for name in missing if topic_named(name).writer != LINK]
+        return dropped, missing
 
 
 def run_status(config: Config, stop: threading.Event) -> None:
@@ -76,7 +84,9 @@ def run_status(config: Config, stop: threading.Event) -> None:
             keeper = Keeper.of(config.runtime, config.robot, "status")
             if keeper is not None:
                 keeper.recover(lambda: shared, service.clock.now_ns())
-            _serve(service, server, StatusFeed(config.robot, shared, clock), stop, keeper)
+            _serve(
+                service, server, StatusFeed(config.robot, shared, clock, bool(config.link.host)), stop, keeper
+            )
     finally:
         server.stop(1.0)
 
@@ -109,7 +119,9 @@ def _serve(
     server.start()
     service.monitor.expect(_TICK_S)
     service.monitor.ready = True
-    get_logger().info("ready", page=page_address(server.shared.config.host, server.port))
+    options = server.shared.config
+    page = page_address(options.host, server.port, secure=bool(options.tls_certificate_file))
+    get_logger().info("ready", page=page)
     while not stop.wait(_TICK_S):
         service.monitor.step_began()
         now = service.clock.now_ns()

@@ -52,14 +52,41 @@ class HfeConfig(BaseModel):
     )
 
 
+class TourConfig(BaseModel):
+    """The tour over all viewpoints of the window."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stops: int = Field(12, ge=1, le=14, description="Viewpoints that are put in order, the best ones.")
+    early_per_nat: float = Field(
+        0.2,
+        ge=0,
+        le=1000,
+        description="Metres of way that a nat is worth for each metre that it is seen earlier; 0: the shortest tour.",
+    )
+    near_m: float = Field(
+        24.0, gt=0, le=1e6, description="Viewpoints are chosen by gain^power exp(-way / this), m,"
+    )
+    gain_power: float = Field(0.5, gt=0, le=4, description="with this power.")
+    min_gain: float = Field(
+        0.15, ge=0, le=100, description="What sees less is no viewpoint while there are others, nats."
+    )
+    detour: float = Field(
+        1.3, ge=1, le=10, description="Way to a frontier beyond the window, for each metre straight there."
+    )
+
+
 class Config(BaseModel):
     """Configuration of lcp; unknown keys are refused at every level."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    planner: Literal["pomcp", "nbv", "hfe"] = Field(
-        "pomcp", description="pomcp: the paper's planner; nbv, hfe: its baselines."
+    planner: Literal["pomcp", "nbv", "hfe", "tour"] = Field(
+        "pomcp",
+        description="pomcp: the paper's planner; nbv, hfe: its baselines; tour: the order of all viewpoints that is "
+        "short and early, where the map itself is the aim (irm: coverage known).",
     )
+    tour: TourConfig = TourConfig()
     nbv: NbvConfig = NbvConfig()
     hfe: HfeConfig = HfeConfig()
     weights: RewardWeights = RewardWeights()

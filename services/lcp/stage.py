@@ -22,7 +22,7 @@ from schemas.world import LocalIrm
 from services.lcp.baselines import FrontierLook, NextBestView
 from services.lcp.config import Config
 from services.lcp.guide import way_along
-from services.lcp.policy_path import covered_by, likely_moves, line_of, step_terms
+from services.lcp.policy_path import covered_by, likely_moves, line_of, moves_to, step_terms
 from services.lcp.problem import (
     Junction,
     coverage_model,
@@ -32,6 +32,7 @@ from services.lcp.problem import (
     node_at,
 )
 from services.lcp.promises import Index, Promises
+from services.lcp.tour import plan_tour
 from services.lcp.viewpoints import warm_up_viewpoints
 
 __all__ = ["Config", "LcpStage", "create", "spec", "warm_up"]
@@ -106,6 +107,8 @@ class LcpStage:
         for index in self._promises.left_alone(now, uncovered):
             if index in uncovered:
                 entropy[_node(irm, index)] = 0.0
+        if self._config.planner == "tour" and not returning:
+            return self._tour(now, request, irm, junction, entropy, uncovered, policy)
         if self._config.planner != "pomcp" and not returning:
             return self._baseline(now, request, irm, junction, entropy, uncovered, policy)
         if not returning and self._should_cover(irm, junction, entropy, policy):
@@ -143,6 +146,34 @@ class LcpStage:
         reason = f"goes to a view worth {view.reward:.2f}"
         return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, view.moves, 0,
                        _EMPTY_TREE, view.reward, 0, 0, 0.0, terms)  # fmt: skip
+
+    def _tour(
+        self,
+        now: Stamp,
+        request: EpisodeRequest,
+        irm: LocalIrm,
+        junction: Junction,
+        entropy: np.ndarray,
+        uncovered: dict[Index, float],
+        policy: GlobalPolicy | None,
+    ) -> LocalPolicy:
+        """The beginning of the tour over all viewpoints; where there are none, along the global path."""
+        k_risk = parameters(self._config.weights).k_risk
+        tour = plan_tour(irm, junction.node, entropy, policy, self._config.tour, k_risk, _MAX_RISK)
+        if tour is None:
+            return self._guide(now, request, irm, junction, policy)
+        moves, at = [], junction.node
+        for node in tour.nodes:
+            moves += moves_to(irm, at, node, k_risk, _MAX_RISK) or []
+            at = node
+            if len(moves) >= self._config.path_steps:
+                break
+        moves = moves[: self._config.path_steps]
+        model = coverage_model(irm, entropy, np.zeros(irm.size**2), junction, self._config)
+        terms = self._promise(now, irm, model, junction, moves, uncovered)
+        reason = f"tour over {len(tour.nodes)} viewpoints that see {tour.gain:.1f} nats"
+        return _policy(now, request, irm, LocalPhase.COVER, reason, policy, junction, moves, 0,
+                       _EMPTY_TREE, float(terms[0].sum()), 0, 0, 0.0, terms)  # fmt: skip
 
     def _should_cover(
         self, irm: LocalIrm, junction: Junction, entropy: np.ndarray, policy: GlobalPolicy | None

@@ -42,6 +42,7 @@ from services.mission.orders import OrderBook
 __all__ = ["Config", "MissionStage", "create", "spec", "warm_up"]
 
 _MAX_JUMP_M = 2.0  # between two steps; more is an odometry fault, not travel
+_STANDS_M = 0.1  # nearer to the last place that was counted: noise of a standing robot's pose, not travel
 
 
 class _Ways(NamedTuple):
@@ -164,6 +165,8 @@ class MissionStage:
             self._home = self._at
         if self._last_xy is not None:
             moved = math.hypot(pose.x_m - self._last_xy[0], pose.y_m - self._last_xy[1])
+            if moved < _STANDS_M:
+                return
             self._distance_m += moved if moved < _MAX_JUMP_M else 0.0
         self._last_xy = (pose.x_m, pose.y_m)
 

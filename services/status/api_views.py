@@ -100,6 +100,7 @@ def _graph_routes(api: APIRouter, shared: SharedStatus) -> None:
 
 
 def _layer(core: StatusCore, name: LayerName) -> Layer:
+    """A layer as it is now. Raises ProblemError."""
     if name is LayerName.RISK:
         risk = core.latest("riskmap/risk_map", RiskMap)
         if risk is not None:
@@ -114,15 +115,19 @@ def _layer(core: StatusCore, name: LayerName) -> Layer:
 def _layer_routes(api: APIRouter, shared: SharedStatus) -> None:
     missing: dict[int | str, dict[str, Any]] = {404: {"description": "Nothing has been seen yet."}}
 
+    def current(layer: LayerName) -> Layer:
+        return shared.read(lambda core, now_ns: _layer(core, layer))
+
+    asked = Depends(current)
+
     @api.get(
         "/layers/{layer}.png",
         tags=["map"],
         response_class=Response,
         responses=_content("image/png", "A pixel a cell", missing),
     )
-    def layer_as_png(layer: LayerName) -> Response:
+    def layer_as_png(found: Layer = asked) -> Response:
         """A layer as a picture, a pixel a cell, the highest y at the top; unknown cells are transparent."""
-        found = shared.read(lambda core, now_ns: _layer(core, layer))
         headers = {**NO_STORE, "X-Frame": found.frame, "X-Resolution-M": f"{found.spec.resolution_m:.9g}"}
         return Response(layer_png(found), media_type="image/png", headers=headers)
 
@@ -132,9 +137,8 @@ def _layer_routes(api: APIRouter, shared: SharedStatus) -> None:
         response_class=Response,
         responses=_content("image/x-portable-graymap", "The image", missing),
     )
-    def layer_as_pgm(layer: LayerName) -> Response:
+    def layer_as_pgm(found: Layer = asked) -> Response:
         """The image of the map_server file."""
-        found = shared.read(lambda core, now_ns: _layer(core, layer))
         return Response(layer_pgm(found), media_type="image/x-portable-graymap", headers=NO_STORE)
 
     @api.get(
@@ -143,16 +147,17 @@ def _layer_routes(api: APIRouter, shared: SharedStatus) -> None:
         response_class=PlainTextResponse,
         responses=_content("application/yaml", "The map_server file", missing),
     )
-    def layer_as_yaml(layer: LayerName) -> Response:
+    def layer_as_yaml(found: Layer = asked) -> Response:
         """The map_server file (YAML) of a layer; its image is the same name with .pgm."""
-        found = shared.read(lambda core, now_ns: _layer(core, layer))
         return Response(layer_yaml(found), media_type="application/yaml", headers=NO_STORE)
 
 
 def _event_routes(api: APIRouter, shared: SharedStatus) -> None:
     @api.get("/events", tags=["events"])
     def events(
-        after: Annotated[int, Query(ge=0, le=_LAST_ID, description="Only events later than this id.")] = 0,
+        after: Annotated[
+            int, Query(ge=0, le=_LAST_ID, description="Only those later than this id; one never given: all.")
+        ] = 0,
         limit: Annotated[int, Query(ge=1, le=2000, description="The newest so many.")] = 200,
     ) -> EventList:
         """What happened and why: targets chosen and dropped, frontiers given up, commands, safety, faults."""

@@ -36,7 +36,8 @@ class Config(BaseModel):
     )
     allowed_hosts: tuple[str, ...] = Field(
         (),
-        description="Names, without port, under which it may be asked; on loopback its own are always among them.",
+        description="Names, without port, under which it may be asked, beside those of loopback. None, and `host` is "
+        "not loopback: any.",
     )
     allowed_origins: tuple[str, ...] = Field(
         (), description="Other sites whose pages may change things, as https://desk:8443."

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
@@ -15,15 +14,15 @@ from planning.grid import GridSpec
 from schemas.base import Message
 from schemas.contract import SECOND_NS
 from schemas.fences import Fences
-from schemas.operation import JudgeReport, LinkReport, MissionState, StageHealth
+from schemas.operation import JudgeReport, LinkReport, MissionState
 from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
-from schemas.topics import health_topic, topic_named
 from schemas.world import CoverageSummary, CoverageWindow, GlobalIrm, GraphRequest, LocalIrm, RiskMap
 from services.status.canvas import TileCanvas
 from services.status.config import Config
 from services.status.events import EventLog
+from services.status.heard import Heard
 from services.status.history import Curve, CurvePoint
 from services.status.memory import LiveMemory
 from services.status.picture import Picture
@@ -32,27 +31,12 @@ from services.status.report import (
     MissionReport,
     PlaceReport,
     PlanReport,
-    StageReport,
     StatusReport,
     TargetReport,
-    TopicReport,
 )
 from services.status.view import SlowView, View
 
-_RATE_SMOOTHING = 0.2
 _M = TypeVar("_M", bound=Message)
-
-
-@dataclass(slots=True)
-class _Seen:
-    """One topic as received: the newest message, when it came (ns, local monotonic), how many, mean
-    interval.
-    """
-
-    message: Message
-    received_ns: int
-    count: int = 1
-    interval_s: float = 0.0
 
 
 class StatusCore:
@@ -66,7 +50,7 @@ class StatusCore:
         self.events = EventLog()
         self.curve = Curve()
         self.memory = LiveMemory()
-        self._seen: dict[str, _Seen] = {}
+        self._heard = Heard(config)
         self._trajectory: list[tuple[float, float]] = []
         self._mirror = GraphMirror()
         self._graph_fits = True
@@ -74,7 +58,7 @@ class StatusCore:
 
     def observe(self, topic_name: str, message: Message, now_ns: int) -> None:
         """Take in one message. now_ns: local monotonic clock, the same one that the other calls are given."""
-        self._note(topic_name, message, now_ns)
+        self._heard.note(topic_name, message, now_ns)
         self.events.observe(message)
         self.memory.observe(message)
         if isinstance(message, Odometry):
@@ -91,7 +75,7 @@ class StatusCore:
             self._note_coverage(message)
 
     def _note_coverage(self, summary: CoverageSummary) -> None:
-        state, judge = self._latest("mission/state", MissionState), self._latest("sim/judge", JudgeReport)
+        state, judge = self.latest("mission/state", MissionState), self.latest("sim/judge", JudgeReport)
         if state is not None:
             seen = math.nan if judge is None else judge.coverage
             self.curve.add(
@@ -103,16 +87,6 @@ class StatusCore:
                     seen,
                 )
             )
-
-    def _note(self, topic_name: str, message: Message, now_ns: int) -> None:
-        seen = self._seen.get(topic_name)
-        if seen is None:
-            self._seen[topic_name] = _Seen(message, now_ns)
-            return
-        interval_s = (now_ns - seen.received_ns) / SECOND_NS
-        smooth = _RATE_SMOOTHING if seen.interval_s > 0 else 1.0
-        seen.interval_s += smooth * (interval_s - seen.interval_s)
-        seen.message, seen.received_ns, seen.count = message, now_ns, seen.count + 1
 
     def _follow(self, odometry: Odometry) -> None:
         at = in_map(odometry.map_to_odom, odometry.pose)
@@ -132,30 +106,16 @@ class StatusCore:
 
     def not_ready(self, now_ns: int) -> list[str]:
         """Why the robot is not ready, in plain words; empty when it is."""
-        reasons = []
-        for stage in self._stages(now_ns):
-            if stage.state == "missing":
-                reasons.append(f"{stage.service}: not heard of yet")
-            elif stage.state == "silent":
-                reasons.append(f"{stage.service}: silent for {stage.age_s:.1f} s")
-            elif stage.state == "not_ready":
-                waiting = f", waiting for {', '.join(stage.waiting_for)}" if stage.waiting_for else ""
-                reasons.append(f"{stage.service}: not ready{waiting}")
-        for name in self.config.expected_topics:
-            seen, limit_ns = self._seen.get(name), topic_named(name).stale_after_ns
-            if seen is None:
-                reasons.append(f"{name}: nothing received yet")
-            elif 0 < limit_ns < now_ns - seen.received_ns:
-                reasons.append(f"{name}: nothing for {(now_ns - seen.received_ns) / SECOND_NS:.1f} s")
-        return reasons
+        return self._heard.not_ready(now_ns)
 
     def status(self, now_ns: int) -> StatusReport:
         """Everything known now."""
         reasons = self.not_ready(now_ns)
-        odometry = self._latest("sim/odometry", Odometry)
-        judge = self._latest("sim/judge", JudgeReport)
+        odometry = self.latest("sim/odometry", Odometry)
+        judge = self.latest("sim/judge", JudgeReport)
         return StatusReport(
             robot=self.robot,
+            silent_s=self._heard.silent_s(now_ns),
             ready=not reasons,
             not_ready_because=reasons,
             mission=self._mission(),
@@ -166,13 +126,13 @@ class StatusCore:
             target_switches=self.target_switches,
             plan=self._plan(now_ns),
             lost=None if judge is None else judge.lost,
-            stages=self._stages(now_ns),
-            topics=self._topics(now_ns),
+            stages=self._heard.stages(now_ns),
+            topics=self._heard.topics(now_ns),
         )
 
     def link(self) -> LinkReport | None:
         """The newest report of the link to the base; None when there is no link."""
-        return self._latest("link/report", LinkReport)
+        return self.latest("link/report", LinkReport)
 
     @property
     def graph(self) -> tuple[int, RoadMap]:
@@ -181,21 +141,17 @@ class StatusCore:
 
     def latest(self, topic_name: str, kind: type[_M]) -> _M | None:
         """The newest message of a topic, or None when none has come."""
-        return self._latest(topic_name, kind)
-
-    def _latest(self, topic_name: str, kind: type[_M]) -> _M | None:
-        seen = self._seen.get(topic_name)
-        return seen.message if seen is not None and isinstance(seen.message, kind) else None
+        return self._heard.latest(topic_name, kind)
 
     def _pose(self) -> PlaceReport | None:
-        odometry = self._latest("sim/odometry", Odometry)
+        odometry = self.latest("sim/odometry", Odometry)
         if odometry is None:
             return None
         at = in_map(odometry.map_to_odom, odometry.pose)
         return PlaceReport(x_m=at.x_m, y_m=at.y_m, yaw_rad=at.yaw_rad)
 
     def _mission(self) -> MissionReport | None:
-        state = self._latest("mission/state", MissionState)
+        state = self.latest("mission/state", MissionState)
         if state is None:
             return None
         return MissionReport(
@@ -211,7 +167,7 @@ class StatusCore:
         )
 
     def _coverage(self, judge: JudgeReport | None) -> CoverageReport | None:
-        summary = self._latest("irm/coverage", CoverageSummary)
+        summary = self.latest("irm/coverage", CoverageSummary)
         if summary is None:
             return None
         return CoverageReport(
@@ -223,7 +179,7 @@ class StatusCore:
         )
 
     def _target(self) -> TargetReport | None:
-        policy = self._latest("gcp/global_policy", GlobalPolicy)
+        policy = self.latest("gcp/global_policy", GlobalPolicy)
         if policy is None:
             return None
         return TargetReport(
@@ -238,57 +194,28 @@ class StatusCore:
         )
 
     def _plan(self, now_ns: int) -> PlanReport | None:
-        plan = self._latest("reconciler/plan", Plan)
-        if plan is None:
+        plan, age_s = self.latest("reconciler/plan", Plan), self._heard.age_s("reconciler/plan", now_ns)
+        if plan is None or age_s is None:
             return None
         return PlanReport(
             safety=plan.safety.value,
             valid=plan.valid,
             reason=plan.reason,
             tau_s=plan.tau_s,
-            age_s=(now_ns - self._seen["reconciler/plan"].received_ns) / SECOND_NS,
+            age_s=age_s,
             length_m=float(np.hypot(np.diff(plan.x_m), np.diff(plan.y_m)).sum()),
         )
 
-    def _stages(self, now_ns: int) -> list[StageReport]:
-        heard = {name.split("/")[0] for name in self._seen if name.endswith("/health")}
-        extra = sorted(heard - set(self.config.expected_services))
-        return [self._stage(name, now_ns) for name in (*self.config.expected_services, *extra)]
-
-    def _stage(self, service: str, now_ns: int) -> StageReport:
-        topic = health_topic(service)
-        health = self._latest(topic.name, StageHealth)
-        if health is None:
-            return StageReport(service=service, state="missing")
-        age_ns = now_ns - self._seen[topic.name].received_ns
-        state = "silent" if age_ns > topic.stale_after_ns else "ok" if health.ready else "not_ready"
-        return StageReport(
-            state=state, age_s=age_ns / SECOND_NS, **health.model_dump(exclude={"stamp_ns", "ready"})
-        )
-
-    def _topics(self, now_ns: int) -> list[TopicReport]:
-        reports = []
-        for name, seen in sorted(self._seen.items()):
-            age_ns, limit_ns = now_ns - seen.received_ns, topic_named(name).stale_after_ns
-            rate_hz = 1.0 / max(seen.interval_s, age_ns / SECOND_NS) if seen.interval_s > 0 else 0.0
-            stale = 0 < limit_ns < age_ns
-            reports.append(
-                TopicReport(
-                    name=name, messages=seen.count, age_s=age_ns / SECOND_NS, rate_hz=rate_hz, stale=stale
-                )
-            )
-        return reports
-
     def picture(self) -> Picture:
         """What the picture of the map shows: coverage, trajectory, robot, plan, frontiers and target."""
-        place, policy = self._pose(), self._latest("gcp/global_policy", GlobalPolicy)
+        place, policy = self._pose(), self.latest("gcp/global_policy", GlobalPolicy)
         road_map = self._mirror.road_map()
         frontiers = road_map.xyz_m[road_map.kind == FRONTIER, :2]
         return Picture(
             canvas=self.canvas.whole(),
             trajectory=tuple(self._trajectory),
             robot=None if place is None else (place.x_m, place.y_m, place.yaw_rad),
-            plan=self._planin_map(),
+            plan=self._plan_in_map(),
             frontiers=tuple((float(x), float(y)) for x, y in frontiers),
             target=None if policy is None or policy.target < 0 else policy.target_xyz_m[:2],
             route=() if policy is None else tuple((float(x), float(y)) for x, y, _ in policy.route_xyz_m),
@@ -331,8 +258,8 @@ class StatusCore:
             events=tuple(self.events.events),
         )
 
-    def _planin_map(self) -> tuple[tuple[float, float], ...]:
-        plan, odometry = self._latest("reconciler/plan", Plan), self._latest("sim/odometry", Odometry)
+    def _plan_in_map(self) -> tuple[tuple[float, float], ...]:
+        plan, odometry = self.latest("reconciler/plan", Plan), self.latest("sim/odometry", Odometry)
         if plan is None or odometry is None or not plan.valid:
             return ()
         frame = planar(odometry.map_to_odom)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,6 +20,16 @@ from schemas.world import CoverageSummary
 _LOG_2 = math.log(2.0)
 _LOW_RISK, _HIGH_RISK = 0.1, 0.3
 _SAME_M = 1.0
+_AT_REST = ("idle", "paused", "stopped", "done")
+"""Phases in which the robot stands because it was told to."""
+SAFETY_WORDS = {
+    "run": "drives on",
+    "degraded": "drives on slowly",
+    "hold": "stands still",
+    "return": "drives home",
+    "done": "stands for good",
+}
+"""What the robot does in each safety state of the plan."""
 _SKIPPED_IDS = 1000
 """More than the events between two snapshots: numbers that clients have seen are not given again."""
 
@@ -50,6 +61,11 @@ class Event(BaseModel):
     data: dict[str, Any] = Field(default_factory=dict)
 
 
+def _without_numbers(text: str) -> str:
+    """A reason whose ages and distances alone have changed is the same one."""
+    return re.sub(r"-?\d+(\.\d+)?", "", text)
+
+
 def risk_in_words(risk: float) -> str:
     """low, medium or high: the probability of failing on the way."""
     return "low risk" if risk < _LOW_RISK else "medium risk" if risk < _HIGH_RISK else "high risk"
@@ -77,7 +93,12 @@ class EventLog:
     _lost: bool = False
 
     def after(self, last_id: int) -> list[Event]:
-        """The events later than one, oldest first."""
+        """The events later than one, oldest first.
+
+        One that was never given is of another life of the service, whose numbers were lost: then all there are.
+        """
+        if last_id > self.last_id:
+            last_id = 0
         return [event for event in self.events if event.id > last_id]
 
     def observe(self, message: Message) -> None:
@@ -129,7 +150,7 @@ class EventLog:
                 policy.target, policy.target_gain, policy.target_distance_m, policy.target_risk
             )
             _, _, why = policy.reason.partition("; ")
-            text = f"chose {told}" + (f"; {why}" if why else "")
+            text = f"chose {told}" + (f"; {why.replace('Q ', 'value ')}" if why else "")
         self.add(
             policy.stamp_ns,
             "target",
@@ -163,10 +184,11 @@ class EventLog:
     def _plan(self, plan: Plan) -> None:
         state = (plan.safety.value, plan.reason if plan.safety.value != "run" else "")
         before, self._safety = self._safety, state
-        if state[0] == before[0]:
+        if [_without_numbers(part) for part in state] == [_without_numbers(part) for part in before]:
             return
-        severity = "info" if state[0] in ("run", "done", "return") else "warning"
-        text = f"safety {state[0]}" + (f": {state[1]}" if state[1] else "")
+        wanted = state[0] in ("run", "done", "return") or (state[0] == "hold" and self._phase in _AT_REST)
+        severity = "info" if wanted else "warning"
+        text = SAFETY_WORDS[state[0]] + (f": {state[1]}" if state[1] else "")
         self.add(plan.stamp_ns, "safety", text, severity, before=before[0])
 
     def _stage(self, health: StageHealth) -> None:

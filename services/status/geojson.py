@@ -98,6 +98,7 @@ class FenceRequest(BaseModel):
         """The polygons, checked. Raises ProblemError, which names the field and the mend."""
         found = []
         for where, feature, rings in _polygons(self.geojson):
+            self._check_said(where, feature)
             points = [[(float(p[0]), float(p[1])) for p in ring] for ring in rings]
             try:
                 check_rings(points, MAX_VERTICES)
@@ -111,6 +112,20 @@ class FenceRequest(BaseModel):
         if len(found) > MAX_FENCES:
             raise ProblemError(422, f"body.geojson: {len(found)} polygons, over {MAX_FENCES}; send fewer")
         return found
+
+    def _check_said(self, where: str, feature: FeatureIn | None) -> None:
+        """Fences come back as features that say their kind and frame: one that says another is no oversight to carry
+        out."""
+        properties = (feature.properties if feature is not None else None) or {}
+        for key, asked, known in (
+            ("kind", self.kind.value, set(FenceKind)),
+            ("frame", self.frame.value, set(FenceFrame)),
+        ):
+            said = properties.get(key)
+            if isinstance(said, str) and said in known and said != asked:
+                name = f"body.geojson{where.partition('.geometry')[0]}.properties.{key}"
+                wrong = f"the feature says {said}, the request {asked}; send it as {said}, or take the property out"
+                raise ProblemError(422, f"{name}: {wrong}", [FieldError(field=name, message=wrong)])
 
     def _fence(self, feature: FeatureIn | None, points: list[list[tuple[float, float]]]) -> Fence:
         properties = (feature.properties if feature is not None else None) or {}

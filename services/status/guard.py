@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from services.status.problems import MEDIA_TYPE, ProblemError, problem_json
 
 _READING = ("GET", "HEAD", "OPTIONS")
 _BODY_TIMEOUT_S = 10.0
@@ -142,9 +143,9 @@ async def _answer(scope: Scope, receive: Receive, send: Send, refused: RefusedEr
         await receive()  # websocket.connect; closing before accepting is answered with 403
         await send({"type": "websocket.close", "code": 1008, "reason": refused.reason[:120]})
         return
-    body = json.dumps({"detail": refused.reason}).encode()
+    body = problem_json(ProblemError(refused.code, refused.reason))
     headers = [
-        (b"content-type", b"application/json"),
+        (b"content-type", MEDIA_TYPE.encode()),
         (b"content-length", str(len(body)).encode()),
         (b"connection", b"close"),
         *_HEADERS,

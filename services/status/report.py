@@ -162,6 +162,9 @@ class StatusReport(_Part):
     """Everything about the mission in one answer; what is not known yet is null."""
 
     robot: str
+    silent_s: float | None = Field(
+        None, description="So long nothing has come from the robot; null: it is heard, or never was."
+    )
     ready: bool
     not_ready_because: list[str]
     mission: MissionReport | None

@@ -34,7 +34,7 @@ from services.status.guard import Guard
 COOKIE = "plgrim_token"
 SESSION_PATH = "/api/v1/session"
 MIN_TOKEN_CHARS = 20
-_HASHED = "sha256:"
+HASHED = "sha256:"
 _POLICY_VIOLATION = 1008
 _COOKIE_AGE_S = 12 * 3600
 
@@ -104,7 +104,7 @@ def read_tokens(path: Path) -> tuple[Token, ...]:
         if not words:
             continue
         tokens.append(_token(words, f"{path}: line {number}"))
-        if not words[2].startswith(_HASHED) and mode & 0o077:
+        if not words[2].startswith(HASHED) and mode & 0o077:
             raise SecurityError(f"{path}: others may read the secrets in it: chmod 600 {path}")
     names = [token.name for token in tokens]
     if len(set(names)) < len(names):
@@ -118,18 +118,18 @@ def _token(words: list[str], where: str) -> Token:
     if len(words) != 3 or words[0] not in Role.__members__:
         raise SecurityError(f"{where}: expected `viewer NAME SECRET` or `operator NAME SECRET`")
     role, name, secret = words
-    if not secret.startswith(_HASHED):
+    if not secret.startswith(HASHED):
         if len(secret) < MIN_TOKEN_CHARS:
             raise SecurityError(
                 f"{where}: the token has less than {MIN_TOKEN_CHARS} characters: make a longer one"
             )
         return Token(Role[role], name, _digest(secret))
     try:
-        digest = bytes.fromhex(secret.removeprefix(_HASHED))
+        digest = bytes.fromhex(secret.removeprefix(HASHED))
     except ValueError:
         digest = b""
     if len(digest) != hashlib.sha256().digest_size:
-        raise SecurityError(f"{where}: {_HASHED} is followed by 64 hexadecimal digits")
+        raise SecurityError(f"{where}: {HASHED} is followed by 64 hexadecimal digits")
     return Token(Role[role], name, digest)
 
 
@@ -254,10 +254,12 @@ def secure(app: FastAPI, config: Config, access: Access | None = None) -> None:
     app.get(SESSION_PATH, tags=["access"])(session)
     app.post(SESSION_PATH, tags=["access"], responses=refused)(open_session)
     app.delete(SESSION_PATH, tags=["access"], responses=refused)(close_session)
-    hosts = ("127.0.0.1", "localhost", "[::1]") if is_loopback(config.host) else ()
+    named = is_loopback(config.host) or config.allowed_hosts
+    # This host's own programs ask by these names wherever it listens, and no foreign name can be made to be one.
+    hosts = ("127.0.0.1", "localhost", "[::1]") if named else ()
     app.add_middleware(
         Guard,
-        hosts=frozenset((*hosts, *config.allowed_hosts)) if hosts or config.allowed_hosts else None,
+        hosts=frozenset((*hosts, *config.allowed_hosts)) if named else None,
         origins=frozenset(config.allowed_origins),
         max_body_bytes=config.max_body_bytes,
     )

@@ -20,6 +20,7 @@ BENCHES = {
     "lcp-speed": "-m tests.bench.lcp_speed --rounds 10",
     "lcp-gap": "-m tests.bench.lcp_gap --lattices 40",
     "lcp-worlds": "-m tests.bench.lcp_worlds --worlds 4",
+    "planning-step": "-m tests.bench.planning_step --seconds 120",
     "qmdp": "-m tests.bench.qmdp --rounds 9 --peer-rounds 1",
 }
 """Name: arguments of the interpreter."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from planning.frames import in_map
 from plgrim.runtime.lockstep import Lockstep
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Inputs, Output, Outputs, StageSpec, Stamp, Topic
@@ -22,6 +24,7 @@ from schemas.operation import (
     MissionPhase,
     MissionState,
 )
+from schemas.sensing import Odometry
 from schemas.snapshot import pack_snapshot, unpack_snapshot
 from schemas.topics import COMMAND
 
@@ -82,9 +85,11 @@ class Operator:
 
 @dataclass
 class Seen:
-    """What an observer heard. track: (seconds, x, y) of the true poses."""
+    """What an observer heard. track: (seconds, x, y) of the true poses; in_odom, in_map: of the estimated ones."""
 
     track: list[tuple[float, float, float]] = field(default_factory=list)
+    in_odom: list[tuple[float, float, float]] = field(default_factory=list)
+    in_map: list[tuple[float, float, float]] = field(default_factory=list)
     answers: list[CommandAnswer] = field(default_factory=list)
     state: MissionState | None = None
     coverage: float = 0.0
@@ -95,10 +100,18 @@ class Seen:
                 at = message.true_pose
                 self.track.append((now / SECOND_NS, at.x_m, at.y_m))
                 self.coverage = message.coverage
+            case Odometry():
+                self.in_odom.append((now / SECOND_NS, message.pose.x_m, message.pose.y_m))
+                place = in_map(message.map_to_odom, message.pose)
+                self.in_map.append((now / SECOND_NS, place.x_m, place.y_m))
             case CommandAnswer():
                 self.answers.append(message)
             case MissionState():
                 self.state = message
+
+    def drift_m(self) -> float:
+        """The largest distance that the two frames have told of one pose."""
+        return max(math.dist(a[1:], b[1:]) for a, b in zip(self.in_odom, self.in_map, strict=True))
 
     def inside(self, x0: float, y0: float, x1: float, y1: float, since_s: float = 0.0) -> int:
         """How many true poses lay in a rectangle."""

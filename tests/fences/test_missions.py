@@ -6,16 +6,31 @@ from pathlib import Path
 
 import pytest
 
-from schemas.fences import FenceKind
+from schemas.fences import FenceFrame, FenceKind
 from schemas.operation import CommandKind, FinishReason, MissionCommand
-from tests.fences.scene import box, command, fence, mission
+from tests.fences.scene import Seen, box, command, fence, mission
 
 EAST = (8.0, -1.0, 16.0, 9.0)
 """All of the east room with half of its door."""
 
 
-def draw(name: str, kind: FenceKind, *corners: float) -> MissionCommand:
-    return command(name, CommandKind.FENCE, fences=[fence(kind, box(*corners))])
+NORTH = (0.0, 8.0, 8.0, 14.0)
+DRIFT = {
+    "slam": {
+        "drift_fraction": 0.1,
+        "drift_yaw_deg_per_10m": 4.0,
+        "closure_min_path_m": 6.0,
+        "closure_radius_m": 3.0,
+        "closure_interval_m": 2.0,
+    }
+}
+"""A poor SLAM: what it believes parts from the truth, and loop closures move `map` against `odom`."""
+
+
+def draw(
+    name: str, kind: FenceKind, *corners: float, frame: FenceFrame = FenceFrame.MAP, weight: float = 1.0
+) -> MissionCommand:
+    return command(name, CommandKind.FENCE, fences=[fence(kind, box(*corners), frame, weight=weight)])
 
 
 @pytest.mark.slow
@@ -50,3 +65,34 @@ def test_ground_behind_a_fence_that_is_removed_is_explored(tmp_path: Path) -> No
     assert end.finish == FinishReason.COVERED
     assert run.seen.inside(*EAST) > 0
     assert run.seen.coverage > 0.95
+
+
+def _first_room(seen: Seen) -> str:
+    for _, x, y in seen.track:
+        if x > 8.5:
+            return "east"
+        if y > 8.5:
+            return "north"
+    return ""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("name", "room"), [("east", EAST), ("north", NORTH)])
+def test_the_room_in_a_priority_polygon_in_odom_is_entered_first(
+    tmp_path: Path, name: str, room: tuple[float, float, float, float]
+) -> None:
+    wanted = draw("a", FenceKind.PRIORITY, *room, frame=FenceFrame.ODOM, weight=10.0)
+    run = mission(tmp_path, {0.5: wanted}, sim=DRIFT)
+    run.until(lambda seen: bool(_first_room(seen)), 200.0)
+    assert _first_room(run.seen) == name
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_geofence_in_odom_bounds_a_mission_that_drifts(tmp_path: Path) -> None:
+    bounds = draw("a", FenceKind.GEOFENCE, -1.0, -1.0, 8.0, 8.0, frame=FenceFrame.ODOM)
+    run = mission(tmp_path, {0.5: bounds}, sim=DRIFT)
+    end = run.to_its_end()
+    assert end.finish == FinishReason.COVERED
+    assert all(-1.0 < x < 8.0 and -1.0 < y < 8.0 for _, x, y in run.seen.in_odom)

@@ -180,3 +180,14 @@ def test_little_that_is_far_away_is_left(worth_m_per_nat: float, area_m2: float,
     assert (state.phase == MissionPhase.DONE) == covered
     if covered:
         assert "places are left" in state.reason
+
+
+def test_a_robot_that_stands_drives_no_way_whatever_the_noise_of_its_pose() -> None:
+    bench = Bench()
+    bench.step((ODOMETRY, odometry(0.0)))
+    for n in range(200):
+        state = bench.step((ODOMETRY, odometry(0.03 * (-1) ** n)))
+    assert state.distance_m == 0.0
+    for n in range(100):
+        state = bench.step((ODOMETRY, odometry(0.04 * n)))  # slower than the noise, a step
+    assert state.distance_m == pytest.approx(4.0, abs=0.2)

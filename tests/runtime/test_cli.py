@@ -107,6 +107,10 @@ def test_the_status_service_answers_over_http_and_over_zenoh(
     reasons = _json(f"{page}/readyz")["reasons"]
     assert isinstance(reasons, list)
     assert any("gcp" in reason for reason in reasons)
+    health = ask_health(link, "status", 5.0)
+    assert health is not None
+    assert "irm/coverage" in health.waiting_for
+    assert "link/report" not in health.waiting_for, "there is one host only"
     assert CliRunner().invoke(application, ["healthcheck", "status"]).exit_code == 0
     assert CliRunner().invoke(application, ["healthcheck", "mission"]).exit_code == 0
     assert CliRunner().invoke(application, ["healthcheck", "router"]).exit_code == 0

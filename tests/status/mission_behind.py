@@ -17,19 +17,20 @@ from tests.mission.test_stage import odometry
 class MissionBehind:
     """Steps the stage with each command, and shows its messages to the status."""
 
-    def __init__(self, shared: SharedStatus) -> None:
-        self.stage = MissionStage(MissionConfig())
+    def __init__(self, shared: SharedStatus, config: MissionConfig | None = None) -> None:
+        self.stage = MissionStage(config or MissionConfig())
         self.carried_out: list[str] = []
+        self.x_m = 0.0
         self._shared = shared
         self._now = 0
         self._lock = threading.Lock()
         shared.desk.send = self.send
-        self._step([(ODOMETRY, odometry(0.0))])
+        self._step([(ODOMETRY, odometry(self.x_m))])
 
     def send(self, command: MissionCommand) -> None:
         """A command comes."""
         self.carried_out.append(command.command_id)
-        self._step([(ODOMETRY, odometry(0.0)), (COMMAND, command)])
+        self._step([(ODOMETRY, odometry(self.x_m)), (COMMAND, command)])
 
     def _step(self, given: list[tuple[Topic[Message], Message]]) -> None:
         with self._lock:

@@ -14,8 +14,8 @@ import pytest
 from fastapi.testclient import TestClient
 
 from planning.grid import FREE
-from schemas.operation import JudgeReport, MissionState
-from schemas.policy import GlobalPolicy
+from schemas.operation import JudgeReport, MissionPhase, MissionState
+from schemas.policy import GlobalPolicy, Plan, SafetyState
 from schemas.world import CoverageSummary, CoverageWindow, GridHeader, RiskMap
 from services.sim.map_server import load_map_server
 from services.status.app import SharedStatus, create_app
@@ -276,3 +276,74 @@ def test_no_number_that_is_not_finite_gets_into_json(client: TestClient, shared:
 
 def test_summary_with_more_reasons_than_places_is_no_fault(shared: SharedStatus) -> None:
     shared.observe("irm/coverage", example(CoverageSummary))
+
+
+def test_a_reader_of_a_life_whose_numbers_were_lost_is_told_everything(
+    client: TestClient, shared: SharedStatus
+) -> None:
+    shared.observe("gcp/global_policy", policy(1))
+    assert client.get("/api/v1/events", params={"after": 1}).json()["events"] == []
+    assert [e["id"] for e in client.get("/api/v1/events", params={"after": 900}).json()["events"]] == [1]
+    stream = client.get("/api/v1/events/stream?once=true", headers={"Last-Event-ID": "900"})
+    assert "id: 1\n" in stream.text
+
+
+@pytest.mark.parametrize(("key", "said"), [("kind", "geofence"), ("frame", "odom")])
+def test_a_feature_that_says_another_kind_or_frame_is_not_turned_into_this_one(
+    client: TestClient, behind: MissionBehind, key: str, said: str
+) -> None:
+    """As when fences that were listed are sent back, all as one kind."""
+    fine = {"type": "Feature", "geometry": POLYGON, "properties": {"kind": "no_go", "frame": "map"}}
+    wrong = {"type": "Feature", "geometry": POLYGON, "properties": {key: said}}
+    answer = draw(client, {"type": "FeatureCollection", "features": [fine, wrong]})
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"] == f"body.geojson.features[1].properties.{key}"
+    assert said in answer.json()["detail"]
+    assert behind.carried_out == []
+    assert draw(client, {"type": "FeatureCollection", "features": [fine]}).status_code == 200
+
+
+def test_every_layer_of_every_kind_is_missing_in_the_same_words(client: TestClient) -> None:
+    for name in ("risk", "coverage"):
+        for kind in ("png", "pgm", "yaml"):
+            answer = client.get(f"/api/v1/layers/{name}.{kind}")
+            assert (answer.status_code, name in answer.json()["detail"]) == (404, True)
+    assert client.get("/api/v1/layers/gravity.png").status_code == 422
+
+
+def test_what_the_robot_does_is_said_in_plain_words_and_a_wanted_stop_is_no_warning(
+    client: TestClient, shared: SharedStatus
+) -> None:
+    told: Plan = example(Plan)
+
+    def plan(safety: SafetyState, reason: str) -> None:
+        shared.observe("reconciler/plan", told.model_copy(update={"safety": safety, "reason": reason}))
+
+    plan(SafetyState.RUN, "covers: value 1.8 by 4096 simulations")
+    state = example(MissionState)
+    shared.observe("mission/state", state.model_copy(update={"phase": MissionPhase.PAUSED, "reason": "so"}))
+    plan(SafetyState.HOLD, "mission paused")
+    shared.observe("mission/state", state.model_copy(update={"phase": MissionPhase.EXPLORE, "reason": "on"}))
+    plan(SafetyState.HOLD, "risk map is 1.6 s old")
+    plan(SafetyState.HOLD, "risk map is 2.1 s old")
+    plan(SafetyState.RUN, "guides to target 4")
+    said = [
+        (event["severity"], event["text"])
+        for event in client.get("/api/v1/events").json()["events"]
+        if event["kind"] == "safety"
+    ]
+    assert said == [
+        ("info", "drives on"),
+        ("info", "stands still: mission paused"),
+        ("warning", "stands still: risk map is 1.6 s old"),
+        ("info", "drives on"),
+    ]
+
+
+def test_why_a_target_was_switched_needs_no_symbol(client: TestClient, shared: SharedStatus) -> None:
+    reason = "frontier 41; switched, Q 6.29 against -0.52 of frontier 12: gain 0.5, 6 m, risk 0.12"
+    shared.observe("gcp/global_policy", policy(41, reason=reason))
+    (event,) = client.get("/api/v1/events").json()["events"]
+    assert event["text"].endswith(
+        "switched, value 6.29 against -0.52 of frontier 12: gain 0.5, 6 m, risk 0.12"
+    )

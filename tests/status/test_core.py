@@ -298,3 +298,17 @@ def test_picture_is_limited_in_size() -> None:
 def test_every_topic_read_is_known_by_name() -> None:
     for name in Config().expected_topics:
         assert "status" in topic_named(name).readers
+
+
+def test_a_robot_of_which_nothing_comes_any_more_is_told_apart_from_a_stale_topic() -> None:
+    status = core()
+    assert status.status(0).silent_s is None  # never heard of
+    fill(status, 0)
+    status.observe("sim/odometry", odometry(0.0), 20 * SECOND_NS)
+    assert status.status(20 * SECOND_NS).silent_s is None  # much is stale, but the robot speaks
+    # The base's own planners go on over a cut link.
+    status.observe("gcp/health", health("gcp"), 29 * SECOND_NS)
+    status.observe("gcp/global_policy", example(GlobalPolicy), 29 * SECOND_NS)
+    assert status.status(30 * SECOND_NS).silent_s == pytest.approx(10.0)
+    status.observe("sim/odometry", odometry(0.0), 31 * SECOND_NS)
+    assert status.status(31 * SECOND_NS).silent_s is None

@@ -16,7 +16,7 @@ from schemas.operation import CommandAnswer, CommandKind, MissionCommand, Missio
 from services.status.app import SharedStatus, StatusServer
 from services.status.config import Config
 from tests.status.browser import chromium, until
-from tests.status.scene import Scene, mission
+from tests.status.scene import Scene, mission, odometry
 
 pytestmark = pytest.mark.slow
 
@@ -38,6 +38,7 @@ class Robot:
         self.asked: list[MissionCommand] = []
         self.fences: list[Fence] = []
         self.moving = True
+        self.only_pose = False
         self.port = 0
         self._stop = threading.Event()
         self.begin()
@@ -62,7 +63,9 @@ class Robot:
 
     def _move(self) -> None:
         while not self._stop.wait(0.1):
-            if self.moving:
+            if self.only_pose:
+                self.shared.observe("sim/odometry", odometry(self.scene.n))
+            elif self.moving:
                 self.scene.step()
 
     def _obey(self, command: MissionCommand) -> None:
@@ -212,11 +215,55 @@ def test_a_page_that_was_away_is_told_only_what_changed(open_page: Callable[...,
 def test_a_stale_topic_looks_stale(open_page: Callable[..., Any], robot: Robot) -> None:
     page = open_page()
     until(page, MAP_SHOWN)
-    robot.moving = False
+    robot.only_pose = True
     until(page, "document.querySelectorAll('.layers .late').length >= 3")
     until(page, "document.querySelector('#bar').classList.contains('warn')")
     until(page, "document.querySelectorAll('tr[data-state=silent]').length >= 5")
+    assert " Hz" not in page.inner_text("tr[data-state=silent]"), "a rate of then is no rate of now"
     assert not page.evaluate("plgrim.link.lost"), "the link itself is well"
+    assert not page.locator(".lostmark").count(), "the robot still speaks"
+
+
+def test_a_robot_that_is_not_heard_any_more_is_unmistakable(
+    open_page: Callable[..., Any], robot: Robot
+) -> None:
+    """As at the base when the radio is gone: its own status service and planners go on."""
+    page = open_page()
+    until(page, MAP_SHOWN)
+    robot.moving = False
+    until(page, "document.querySelector('.lostmark')?.textContent === 'ROBOT SILENT'")
+    assert "Nothing has come from it for" in page.inner_text("#bar")
+    assert page.evaluate("document.querySelector('#bar').classList.contains('bad')")
+    assert page.evaluate("document.querySelector('.mapbox').classList.contains('lost')")
+    assert page.title().startswith("✕ robot silent")
+    assert page.locator("#command-stop").is_enabled(), "it may still get through"
+    robot.moving = True
+    until(page, "!document.querySelector('.lostmark')")
+
+
+def test_the_end_of_a_mission_is_not_called_a_lost_link(open_page: Callable[..., Any], robot: Robot) -> None:
+    """`plgrim demo` ends its services with the mission."""
+    page = open_page(quiet=False)
+    until(page, MAP_SHOWN)
+    robot.scene.phase = MissionPhase.DONE
+    until(page, "plgrim.store.get('status').mission.phase === 'done'")
+    robot.server.stop()
+    until(page, "document.querySelector('.lostmark')?.textContent === 'MISSION OVER'")
+    assert "what you see is" in page.inner_text("#bar")
+    assert "LINK LOST" not in page.inner_text("body")
+
+
+def test_a_choice_of_layers_is_kept_and_a_broken_one_does_no_harm(open_page: Callable[..., Any]) -> None:
+    page = open_page()
+    until(page, MAP_SHOWN)
+    page.click("#layer-risk")
+    page.reload()
+    until(page, MAP_SHOWN)
+    assert not page.is_checked("#layer-risk")
+    page.evaluate("localStorage.setItem('plgrim.layers', '{broken')")
+    page.reload()
+    until(page, MAP_SHOWN)
+    assert page.is_checked("#layer-risk")
 
 
 @pytest.mark.parametrize("command", ["pause", "home"])

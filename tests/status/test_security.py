@@ -203,3 +203,25 @@ def test_answers_tell_browsers_to_keep_to_what_was_said(tokens_file: Path) -> No
     answer = TestClient(create_app(SharedStatus(Config(), "robot")), base_url=BASE).get("/healthz")
     assert answer.headers["x-content-type-options"] == "nosniff"
     assert answer.headers["x-frame-options"] == "DENY"
+
+
+def test_programs_of_this_host_may_ask_whatever_other_names_it_has(tokens_file: Path) -> None:
+    def ask(host: str, **config: object) -> int:
+        settings = Config.model_validate({"trusted_network": True, "host": "0.0.0.0", **config})
+        return TestClient(application(settings), base_url=f"http://{host}:8080").get("/show").status_code
+
+    assert ask("127.0.0.1", allowed_hosts=["robot.example"]) == 401  # a token is needed: it got through
+    assert ask("robot.example", allowed_hosts=["robot.example"]) == 401
+    assert ask("evil.example", allowed_hosts=["robot.example"]) == 403
+    assert ask("anything.example") == 401
+
+
+def test_what_the_guard_refuses_is_a_problem_as_every_other_error(tokens_file: Path) -> None:
+    asking = client(tokens_file, max_body_bytes=1024)
+    large = asking.post("/change", content=b" " * 2000, headers=bearer(ANNA))
+    foreign = asking.get("/show", headers={"Host": "evil.example"})
+    for answer, status in ((large, 413), (foreign, 403)):
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert answer.json()["status"] == status
+        assert answer.json()["title"]
+        assert "status." in answer.json()["detail"]

@@ -46,6 +46,11 @@ export class Link {
     };
   }
 
+  // There is a token now: a connection that was refused for want of one is tried again at once.
+  retry() {
+    if (this.socket && this.socket.readyState >= WebSocket.CLOSING) this.reconnect();
+  }
+
   reconnect() {
     const old = this.socket;
     this.socket = null;

@@ -41,7 +41,12 @@ app.link = new Link(address.href, (parts, full) => {
 }, wakePanels);
 
 function startLayers() {
-  const held = JSON.parse(localStorage.getItem("plgrim.layers") ?? "{}");
+  let held = {};
+  try {
+    held = JSON.parse(localStorage.getItem("plgrim.layers") ?? "{}") ?? {};
+  } catch {
+    // kept by another version, or no storage in this browser
+  }
   return Object.fromEntries(LAYERS.map(([key, , shown]) => [key, held[key] ?? shown]));
 }
 
@@ -53,7 +58,11 @@ function useMap(canvas, shown) {
     renew();
   }, []);
   useEffect(() => {
-    localStorage.setItem("plgrim.layers", JSON.stringify(shown));
+    try {
+      localStorage.setItem("plgrim.layers", JSON.stringify(shown));
+    } catch {
+      // no storage in this browser: the choice is not kept
+    }
     if (!app.map) return;
     app.map.shown = shown;
     app.map.redraw();
@@ -85,8 +94,7 @@ function ReadOut({ map }) {
 function MapBox({ shown, setShown, tools }) {
   const canvas = useRef(null);
   const map = useMap(canvas, shown);
-  const { link } = app;
-  const lost = link.lost && link.everHeard;
+  const mark = lostMark(), lost = mark !== "";
   return html`<section class=${lost ? "mapbox lost" : "mapbox"} aria-label="Map">
     <canvas ref=${canvas} tabindex="0" role="application" id="map" aria-describedby="map-keys"
       aria-label="Map of the mission" data-drawing=${tools.draft ? "yes" : null}></canvas>
@@ -100,8 +108,19 @@ function MapBox({ shown, setShown, tools }) {
     </div>
     <${LayerBox} shown=${shown} setShown=${setShown} />
     <${ReadOut} map=${map} />
-    ${lost ? html`<div class="lostmark" aria-hidden="true">LINK LOST</div>` : null}
+    ${lost ? html`<div class="lostmark" aria-hidden="true">${mark}</div>` : null}
   </section>`;
+}
+
+// Written across a map that is no longer that of now; empty while it is.
+function lostMark() {
+  const { link } = app, status = store.get("status");
+  if (link.lost && link.everHeard) return hasEnded(status) ? "MISSION OVER" : "LINK LOST";
+  return status && status.silent_s !== null ? "ROBOT SILENT" : "";
+}
+
+function hasEnded(status) {
+  return ["done", "stopped"].includes(status?.mission?.phase);
 }
 
 // What is wrong, in one bar: the link above all else.
@@ -111,9 +130,17 @@ function Bar({ status }) {
     return html`<div class="bar bad" role="alert" id="bar"><strong>No live data.</strong> This page needs a token to read.
       <button type="button" id="read-token" onClick=${readToken}>Give a token</button></div>`;
   if (!link.everHeard) return html`<div class="bar" role="status" id="bar">Connecting to the robot…</div>`;
+  if (link.lost && hasEnded(status))
+    return html`<div class="bar bad" role="alert" id="bar"><strong>Mission over</strong> (${status.mission.finish}), and the
+      service of this page has ended or is out of reach: what you see is ${age(link.silentMs() / 1000)} old.</div>`;
   if (link.lost)
     return html`<div class="bar bad" role="alert" id="bar"><strong>LINK LOST</strong> What you see is
       ${" "}${age(link.silentMs() / 1000)} old. The robot goes on by itself; commands do not reach it. Reconnecting…</div>`;
+  const silent_s = status?.silent_s ?? null;
+  if (silent_s !== null)
+    return html`<div class="bar bad" role="alert" id="bar"><strong>ROBOT SILENT</strong> Nothing has come from it for
+      ${" "}<span aria-live="off">${age(silent_s)}</span>; what you see is that old. Its link or its services are down; a robot
+      that is well goes on by itself. Commands may not reach it: their answer says so.</div>`;
   const reasons = status?.not_ready_because ?? [];
   if (reasons.length)
     return html`<div class="bar warn" role="status" id="bar"><strong>Not ready:</strong> ${reasons.join("; ")}</div>`;
@@ -122,7 +149,7 @@ function Bar({ status }) {
 
 async function readToken() {
   const token = await new Promise((resolve) => app.askToken("Reading needs a token here.", resolve));
-  if (token && (await api.openSession(token)).ok) app.link.reconnect();
+  if (token && (await api.openSession(token)).ok) app.link.retry();
 }
 
 function useTools(setAnswer) {
@@ -175,11 +202,11 @@ function Page() {
     setAnswer(await api.change("POST", `api/v1/mission/${kind}`));
   };
   const setBudget = async (seconds) => setAnswer(await api.change("PUT", "api/v1/mission/time-budget", { time_budget_s: seconds }));
-  const title = link.lost && link.everHeard ? "✕ link lost" : status?.mission?.phase ?? "…";
+  const title = lostMark() ? `✕ ${lostMark().toLowerCase()}` : status?.mission?.phase ?? "…";
   useEffect(() => void (document.title = `${title} · PLGRIM ${status?.robot ?? ""}`));
   return html`
     <header><h1>PLGRIM <span class="soft">${status?.robot ?? ""}</span></h1><${Bar} status=${status} /></header>
-    <main class=${link.lost && link.everHeard ? "old" : ""}>
+    <main class=${lostMark() ? "old" : ""}>
       <${MapBox} shown=${shown} setShown=${setShown} tools=${tools} />
       <div class="panels">
         <section aria-labelledby="h-mission"><h2 id="h-mission">Mission</h2>
@@ -204,5 +231,5 @@ render(html`<${Page} />`, Object.assign(document.getElementById("app"), { textCo
 const given = /^#token=(.+)$/.exec(location.hash)?.[1];
 if (given) {
   history.replaceState(null, "", location.pathname + location.search);
-  if ((await api.openSession(decodeURIComponent(given))).ok) app.link.reconnect();
+  if ((await api.openSession(decodeURIComponent(given))).ok) app.link.retry();
 }

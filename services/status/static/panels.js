@@ -2,7 +2,7 @@
 
 import { html, useEffect, useRef, useState } from "./vendor/htm-preact.module.js";
 import { FENCE_KINDS } from "./layers.js";
-import { PHASES, STATES, age, clock, duration, metres, percent, targetWords } from "./words.js";
+import { MOTION, PHASES, STATES, age, clock, duration, metres, percent, targetWords } from "./words.js";
 
 export function Mission({ status, policy, plan }) {
   const mission = status?.mission, coverage = status?.coverage;
@@ -12,9 +12,10 @@ export function Mission({ status, policy, plan }) {
     ["Covered", coverage ? percent(coverage.belief) + (coverage.judge === null ? "" : ` (true: ${percent(coverage.judge)})`) : "–"],
     ["Time", duration(mission.elapsed_s) + budget],
     ["Driven", `${metres(mission.distance_m)}, home in ${metres(mission.return_distance_m)}`],
-    ["Frontiers", coverage ? `${coverage.frontiers}${mission.left ? `, ${mission.left} places left` : ""}` : "–"],
+    ["Frontiers", coverage ? `${coverage.frontiers}${mission.left ? `; ${mission.left} places not covered yet` : ""}` : "–"],
     ["Target", targetWords(policy)],
-    ["Motion", plan ? `${plan.safety}${plan.valid ? "" : ", stopped"}${plan.reason ? `: ${plan.reason}` : ""}` : "–"],
+    ["Motion", plan ? `${MOTION[plan.safety] ?? plan.safety}${plan.valid || plan.safety === "hold" || plan.safety === "done" ? "" : ", no path"}${
+      plan.reason ? `: ${plan.reason}` : ""}` : "–"],
   ];
   return html`
     <p class="phase" data-phase=${mission.phase}><strong>${PHASES[mission.phase] ?? mission.phase}</strong>
@@ -89,14 +90,18 @@ export function Services({ status, sinceS }) {
     <tbody>${stages.map((stage) => {
       const [sign, words] = STATES[stage.state] ?? ["?", stage.state];
       const late = stage.age_s === null ? null : stage.age_s + sinceS;
+      const heard = stage.state === "ok" || stage.state === "not_ready"; // else its last figures are those of then
       const waiting = stage.waiting_for.length ? `waits for ${stage.waiting_for.join(", ")}` : "";
+      const wrong = [stage.last_error && `last error: ${stage.last_error}`, stage.degraded && `degraded: ${stage.degraded}`]
+        .filter(Boolean).join("; ");
       return html`<tr key=${stage.service} data-state=${stage.state}>
         <th scope="row">${stage.service}</th><td><span class="sign" aria-hidden="true">${sign}</span> ${words}</td>
-        <td class="number">${stage.rate_hz.toFixed(1)} Hz</td><td class="number wide">${stage.step_p50_ms.toFixed(1)} ms</td>
+        <td class="number">${heard ? `${stage.rate_hz.toFixed(1)} Hz` : "–"}</td>
+        <td class="number wide">${heard ? `${stage.step_p50_ms.toFixed(1)} ms` : "–"}</td>
         <td class="number">${age(late)}</td>
         <td class="number">${status.restarts?.[stage.service] ?? 0}</td></tr>
-        ${stage.last_error || waiting ? html`<tr class="more" key=${`${stage.service}-more`}><td colspan="6">${
-          stage.last_error ? `last error: ${stage.last_error}` : ""} ${waiting}</td></tr>` : null}`;
+        ${wrong || waiting ? html`<tr class="more" key=${`${stage.service}-more`}><td colspan="6">
+          ${wrong ? html`<strong>${wrong}</strong> ` : null}${waiting}</td></tr>` : null}`;
     })}</tbody></table></div>`;
 }
 

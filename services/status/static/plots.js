@@ -27,7 +27,7 @@ export function Plot({ label, columns, series, unit, range }) {
       scales: { x: { time: false }, y: { range } },
       axes: [
         { ...axis, size: 28, space: 70, values: (_, marks) => marks.map(clock) },
-        { ...axis, size: 46, values: (_, marks) => marks.map((mark) => `${+mark.toFixed(3)}${unit}`) },
+        { ...axis, size: 54, values: (_, marks) => marks.map((mark) => `${+mark.toFixed(3)}${unit}`) },
       ],
       series: [{ label: "at", value: (_, v) => (v === null ? "–" : clock(v)) },
         ...series.map(({ name, colour, dash }) => ({ label: name, stroke: css(colour), width: 2, dash,

@@ -24,6 +24,10 @@ export function percent(share) {
 export const PHASES = { idle: "Waiting for the start", explore: "Exploring", paused: "Paused",
   return: "Returning home", stopped: "Stopped", done: "Finished" };
 
+// What the robot does in each safety state of the plan.
+export const MOTION = { run: "drives", degraded: "drives slowly", hold: "stands still", return: "drives home",
+  done: "stands for good" };
+
 export const STATES = { ok: ["●", "working"], not_ready: ["◐", "not ready"], silent: ["▲", "silent"],
   missing: ["✕", "not heard of"] };
 
