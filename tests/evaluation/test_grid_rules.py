@@ -20,8 +20,10 @@ from plgrim.evaluation.grid_kernels import (
     block_minimum,
     connected_open,
     frontier_cells,
+    in_sight,
     is_open_line,
     scan,
+    without_settled,
 )
 from plgrim.evaluation.grid_peers import best_node, discounted_utility, explore, nearest
 from plgrim.evaluation.grid_rules import (
@@ -31,6 +33,7 @@ from plgrim.evaluation.grid_rules import (
     MapError,
     ariadne_map,
     dare_map,
+    first_move,
     make_world,
     ray_ends,
     read_map,
@@ -174,6 +177,53 @@ def test_simple_rules_end_with_the_map_known(rules: str, rule: object) -> None:
     assert np.array_equal(world.belief[world.belief != UNSEEN], world.truth[world.belief != UNSEEN])
     goal, _ = best_node(world, nearest)
     assert goal < 0 or isinstance(world, AriadneWorld)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.6), st.floats(0.0, 0.3))
+@settings(max_examples=40, deadline=None)
+def test_unseen_cells_beside_settled_ground_alone_become_walls(
+    seed: int, unseen: float, open_share: float
+) -> None:
+    random = np.random.default_rng(seed)
+    belief = np.where(random.random((9, 12)) < unseen, UNSEEN, OPEN).astype(np.uint8)
+    belief[random.random(belief.shape) < 0.2] = SOLID
+    open_border = (random.random(belief.shape) < open_share) & (belief == OPEN)
+    found = without_settled(belief, open_border)
+    for row, column in np.ndindex(belief.shape):
+        around = (slice(max(0, row - 1), row + 2), slice(max(0, column - 1), column + 2))
+        shut = (
+            belief[row, column] == UNSEEN and (belief[around] == OPEN).any() and not open_border[around].any()
+        )
+        assert found[row, column] == (SOLID if shut else belief[row, column])
+
+
+@pytest.mark.parametrize("rules", ["ariadne", "dare"])
+def test_what_a_useful_node_counts_stays_unseen_and_the_rest_of_the_frontier_is_shut(rules: str) -> None:
+    world = make_world(room_map(rules), rules)  # type: ignore[arg-type]
+    shut = 0
+    while not world.done:
+        goal, before = best_node(world, nearest)
+        world.move(first_move(before, world.at, goal))
+        given_away = world.belief_of_use()
+        changed = given_away != world.belief
+        assert np.all(world.belief[changed] == UNSEEN)
+        assert np.all(given_away[changed] == SOLID)
+        shut += int(changed.sum())
+        if not isinstance(world, DareWorld):
+            continue
+        cells, place = world.frontier()
+        seen = np.zeros((len(world.node), len(cells)), np.bool_)
+        in_sight(world.belief, world.node, cells, world.place, place, world.utility_range, seen)
+        counted = seen[world.utility > 0].any(axis=0)
+        for (x, y), counts in zip(cells.tolist(), counted.tolist(), strict=True):
+            assert not (counts and changed[y - 1 : y + 2, x - 1 : x + 2].any())
+    if isinstance(world, DareWorld):
+        cells, place = world.frontier()
+        seen = np.zeros((len(world.node), len(cells)), np.bool_)
+        in_sight(world.belief, world.node, cells, world.place, place, world.utility_range, seen)
+        left = frontier_cells(world.belief_of_use())
+        assert not {tuple(c) for c in cells[seen.any(axis=0)].tolist()} & {tuple(c) for c in left.tolist()}
+    assert shut > 0
 
 
 def test_dare_nodes_are_multiples_of_four_metres_from_the_start() -> None:
