@@ -141,7 +141,7 @@ class GridWorld(ABC):
         """Whether the protocol calls the map explored."""
 
     def belief_of_use(self) -> NDArray[np.uint8]:
-        """What is known, where unseen cells that no node's utility will ever count are SOLID; not to be changed."""
+        """What is known, with unseen cells that no node's utility counts any more SOLID; not to be changed."""
         return self.belief
 
     def unseen_cells(self) -> int:
@@ -204,7 +204,6 @@ class AriadneWorld(GridWorld):
         self._seen: list[NDArray[np.int64]] = []
         self._ended: list[bool] = []
         self._frontier: NDArray[np.int64] = np.zeros(0, np.int64)
-        self._open_border: NDArray[np.int64] = np.zeros((0, 2), np.int64)
         self.node = np.array([grid.start], np.int64)
         self.look()
         self.node = np.zeros((0, 2), np.int64)
@@ -260,18 +259,6 @@ class AriadneWorld(GridWorld):
         for i, seen in enumerate(self._seen):
             self._ended[i] = self._ended[i] or len(seen) <= self.min_utility
             self.utility[i] = 0 if self._ended[i] else len(seen)
-        nobody = np.zeros(0, np.int64)
-        useful = [seen for i, seen in enumerate(self._seen) if self.utility[i] > 0]
-        settled = np.isin(frontier, np.concatenate([nobody, *self._seen]))
-        settled &= ~np.isin(frontier, np.concatenate([nobody, *useful]))
-        self._open_border = cells[~settled]
-
-    def belief_of_use(self) -> NDArray[np.uint8]:
-        """Of the frontier, what nodes see but none with any utility does is settled, with the blocks around."""
-        open_border = np.zeros(self.belief.shape, np.bool_)
-        for x, y in self._open_border.tolist():
-            open_border[max(0, y - 4) : y + 8, max(0, x - 4) : x + 8] = True
-        return without_settled(self.belief, open_border)
 
     def _sight(self, cells: NDArray[np.int64], part: slice) -> NDArray[np.bool_]:
         seen = np.zeros((len(self.node[part]), len(cells)), np.bool_)

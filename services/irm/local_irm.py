@@ -15,6 +15,7 @@ from planning.sight import visible_mass_over
 from schemas.base import Pose
 from schemas.world import LocalIrm
 from services.irm.config import Config
+from services.irm.glimpses import add_glimpses
 from services.irm.lattice import choose_anchors, connect_neighbours, halve, halve_heights, sum_patches
 from services.irm.window import Window
 
@@ -53,6 +54,7 @@ class LocalIrmBuilder:
         entropy = self._patch_sum(window, counted, ix0, iy0, window.uncovered)[0].astype(np.float32)
         entropy[entropy < c.min_node_entropy] = 0.0
         reach = math.ceil(c.sensor_range_m / c.spacing_m)
+        visible = self._visible(window, anchor, state, entropy, ix0, iy0, reach)
         self.version += 1
         return LocalIrm(
             stamp_ns=stamp_ns,
@@ -77,7 +79,7 @@ class LocalIrmBuilder:
             bent_edge=bent_edge[:bent],
             bent_start=bent_start[: bent + 1],
             bent_xy=bent_xy[: bent_start[bent]],
-            visible=self._visible(window, anchor, state, entropy, ix0, iy0, reach),
+            visible=visible,
         )
 
     def state(self) -> list[list[float]]:
@@ -137,6 +139,7 @@ class LocalIrmBuilder:
         iy0: int,
         reach: int,
     ) -> NDArray[np.uint32]:
+        """What each node sees; with `coverage: known` entropy is changed to what can be seen at all."""
         c, s = self.config, window.spec
         # Halves of even global index, so that what a node sees does not change as the window rolls.
         skip_x, skip_y = s.ix0 % 2, s.iy0 % 2
@@ -163,6 +166,11 @@ class LocalIrmBuilder:
             opaque, ground, top, mass, patch.astype(np.int32), ix * s.resolution_m, iy * s.resolution_m, res,
             c.sensor_range_m, c.sensor_height_m, c.size, reach, state, anchor, entropy > 0.0, rows,
         )  # fmt: skip
+        if c.coverage == "known" and window.top_m is None:
+            add_glimpses(
+                opaque, mass, patch.astype(np.int32), ix * s.resolution_m, iy * s.resolution_m, res,
+                c.sensor_range_m, c.size, reach, state, anchor, entropy, rows,
+            )  # fmt: skip
         return rows
 
 
