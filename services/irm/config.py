@@ -40,11 +40,6 @@ class Config(BaseModel):
     unknown_decay_m: float = Field(
         4.0, gt=0, le=1000, description="less with its depth: exp(-depth / this), m."
     )
-    walls_stay: bool = Field(
-        True,
-        description="What was an obstacle stays known where the risk map does not show it any more; false where every "
-        "risk map holds all that is known within it.",
-    )
     unknown_solid: bool = Field(
         True,
         description="Unseen cells count amid unseen ones only: gaps between far rays are none. False: all.",

@@ -1,4 +1,7 @@
-"""Patches of which no node sees half: narrow gaps into what may be free, inner corners (`coverage: known`)."""
+"""Patches of which no node sees half: narrow gaps into what may be free, inner corners (`coverage: known`).
+
+At the full resolution: at half of it the cell beside a wall is hidden by the wall.
+"""
 
 from __future__ import annotations
 

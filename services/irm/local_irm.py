@@ -157,21 +157,30 @@ class LocalIrmBuilder:
             halve_heights(window.elevation_m[part], window.top_m[part], ground, top)
         rows = np.zeros((c.size * c.size, 2 * reach + 1), np.uint32)
         res = 2.0 * s.resolution_m
-        column = np.floor(((ix + 2 * np.arange(half[1]) + 1.0) * s.resolution_m) / c.spacing_m) - ix0
-        row = np.floor(((iy + 2 * np.arange(half[0]) + 1.0) * s.resolution_m) / c.spacing_m) - iy0
-        patch = row[:, None] * c.size + column[None, :]
-        outside = ((row < 0) | (row >= c.size))[:, None] | ((column < 0) | (column >= c.size))[None, :]
-        patch[outside] = -1
+        patch = self._patches(*half, ix // 2, iy // 2, res, ix0, iy0)
         visible_rows(
-            opaque, ground, top, mass, patch.astype(np.int32), ix * s.resolution_m, iy * s.resolution_m, res,
+            opaque, ground, top, mass, patch, ix * s.resolution_m, iy * s.resolution_m, res,
             c.sensor_range_m, c.sensor_height_m, c.size, reach, state, anchor, entropy > 0.0, rows,
         )  # fmt: skip
         if c.coverage == "known" and window.top_m is None:
+            patch = self._patches(s.height, s.width, s.ix0, s.iy0, s.resolution_m, ix0, iy0)
             add_glimpses(
-                opaque, mass, patch.astype(np.int32), ix * s.resolution_m, iy * s.resolution_m, res,
-                c.sensor_range_m, c.size, reach, state, anchor, entropy, rows,
+                hides, window.entropy * window.uncovered, patch, s.ix0 * s.resolution_m, s.iy0 * s.resolution_m,
+                s.resolution_m, c.sensor_range_m, c.size, reach, state, anchor, entropy, rows,
             )  # fmt: skip
         return rows
+
+    def _patches(
+        self, height: int, width: int, first_x: int, first_y: int, resolution_m: float, ix0: int, iy0: int
+    ) -> NDArray[np.int32]:
+        """The node whose patch holds the centre of each cell of a grid, (h, w); -1 outside the lattice."""
+        size, spacing_m = self.config.size, self.config.spacing_m
+        column = np.floor((first_x + np.arange(width) + 0.5) * resolution_m / spacing_m) - ix0
+        row = np.floor((first_y + np.arange(height) + 0.5) * resolution_m / spacing_m) - iy0
+        patch = row[:, None] * size + column[None, :]
+        outside = ((row < 0) | (row >= size))[:, None] | ((column < 0) | (column >= size))[None, :]
+        patch[outside] = -1
+        return np.asarray(patch, np.int32)
 
 
 @njit

@@ -159,8 +159,6 @@ def build_window(
     dilate_disc(reachable, risk.footprint_radius_m / g.resolution_m, ground)
     ground &= (risk.state == FREE) & ~fence
     ground |= forgotten
-    if not config.walls_stay:
-        layer[(layer == KNOWN) & (risk.state == UNKNOWN)] = 0
     layer[risk.state != UNKNOWN] = KNOWN
     layer[ground] = GROUND
     unseen = layer == 0
