@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plgrim.errors import PlgrimError
+from planning.clusters import label_components
 from plgrim.evaluation.grid_kernels import (
     OPEN,
     SOLID,
@@ -259,6 +260,19 @@ class AriadneWorld(GridWorld):
         for i, seen in enumerate(self._seen):
             self._ended[i] = self._ended[i] or len(seen) <= self.min_utility
             self.utility[i] = 0 if self._ended[i] else len(seen)
+
+    def belief_of_use(self) -> NDArray[np.uint8]:
+        """Openings that lead to less than what may stay unseen are shut: w cells wide, they lead to w x w or so."""
+        cells = self.frontier()
+        mask = np.zeros((self.truth.shape[0] // 4 + 1, self.truth.shape[1] // 4 + 1), np.bool_)
+        mask[cells[:, 1] // 4, cells[:, 0] // 4] = True
+        labels = np.zeros(mask.shape, np.int32)
+        pieces = label_components(mask, labels)
+        wide = np.bincount(labels.ravel(), minlength=pieces + 1) * 4
+        open_border = np.zeros(self.belief.shape, np.bool_)
+        for y, x in np.argwhere(mask & (wide[labels] ** 2 > _ENOUGH_CELLS)).tolist():
+            open_border[max(0, 4 * y - 4) : 4 * y + 8, max(0, 4 * x - 4) : 4 * x + 8] = True
+        return without_settled(self.belief, open_border)
 
     def _sight(self, cells: NDArray[np.int64], part: slice) -> NDArray[np.bool_]:
         seen = np.zeros((len(self.node[part]), len(cells)), np.bool_)

@@ -67,7 +67,7 @@ def plan_tour(
     for k in range(count):
         away = _costs(irm, int(stops.node[k]), risk_weight_m, max_risk)
         leg[k] = stops.beyond_m[k] + away[stops.node] + stops.beyond_m
-    found = latency_tour(leg, stops.gain, config.early_per_nat)
+    found = latency_tour(leg, stops.gain + config.stop_gain, config.early_per_nat)
     order = [int(stops.node[k]) for k in found.order]
     return Tour(order, float(found.first_cost.min()), float(stops.gain.sum()))
 
