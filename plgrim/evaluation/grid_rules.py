@@ -366,7 +366,8 @@ class DareWorld(GridWorld):
         key = (place / self.voxel).astype(np.int64)
         away = np.linalg.norm(place - key * self.voxel, axis=1)
         number: dict[tuple[int, ...], int] = {}
-        voxel, best = np.zeros(len(cells), np.int64), []
+        best: list[int] = []
+        voxel = np.zeros(len(cells), np.int64)
         for i, k in enumerate(map(tuple, key.tolist())):
             voxel[i] = number.setdefault(k, len(number))
             if voxel[i] == len(best):
