@@ -68,7 +68,8 @@ class ClockConfig(_Section):
     """Reading of `source` at mission clock 0, ns. Negative where a mission goes on after a reboot, in which
     CLOCK_MONOTONIC has begun anew."""
     source: Literal["monotonic", "realtime"] = "monotonic"
-    """monotonic: one host, shared by its processes and containers. realtime: several hosts with synchronised clocks."""
+    """monotonic: one host, shared by its processes and containers. realtime: several hosts with synchronised clocks;
+    the time of day is read once a boot, later steps of it are ignored."""
 
 
 class RuntimeConfig(_Section):

@@ -24,6 +24,12 @@ def host_and_port(endpoint: str) -> tuple[str, int] | None:
     return host.strip("[]"), int(port)
 
 
+def options(endpoint: str) -> list[str]:
+    """Names of the options behind an endpoint: `enable_mtls` of `tls/base:7447#enable_mtls=false`."""
+    _, _, given = endpoint.partition("#")
+    return [one.partition("=")[0].strip() for one in given.split(";") if one.strip()]
+
+
 def is_local(endpoint: str) -> bool:
     """Whether an endpoint stays on this host: loopback, or a unix socket."""
     place = host_and_port(endpoint)

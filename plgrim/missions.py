@@ -19,6 +19,7 @@ from plgrim.registry import STAGES
 from plgrim.runtime.router import page_address
 from plgrim.runtime.supervisor import Command, Supervisor, plgrim_command
 from plgrim.runtime.zenoh_session import Link, connect
+from plgrim.security.exposure import check_client
 from plgrim.security.local_token import page_fragment, with_local_token
 from schemas.base import Message
 from schemas.codec import decode
@@ -105,6 +106,7 @@ def run_live(
 
 def watch(config: Config, out_dir: Path, stop: threading.Event, console: Console) -> Result:
     """Join a running system as one more client, follow the mission to its end, write and give the result."""
+    check_client(config)
     recorder = MissionRecorder(config.seed, world_name(config), "live", config.clock.speed)
     began = time.monotonic()
     with (

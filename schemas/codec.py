@@ -40,7 +40,6 @@ _DTYPES = frozenset(
     {"float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"}
 )
 _MAX_AXES = 4
-_PEEK_BYTES = 1024
 _M = TypeVar("_M", bound=Message)
 
 
@@ -124,25 +123,6 @@ def _unpack(payload: bytes, max_bytes: int) -> dict[str, Any]:
     if not isinstance(body, dict):
         raise MalformedError("the body is not a map")
     return body
-
-
-def peek(payload: bytes) -> tuple[int, int]:
-    """(epoch, sequence) of a message in the plain form, from its first bytes alone. Raises MalformedError.
-
-    Nothing is checked: for bookkeeping on messages that somebody else decodes.
-    """
-    unpacker = msgpack.Unpacker(raw=False, max_buffer_size=_PEEK_BYTES)
-    unpacker.feed(memoryview(payload)[_PREFIX_BYTES : _PREFIX_BYTES + _PEEK_BYTES])
-    found: dict[str, Any] = {}
-    try:
-        for _ in range(unpacker.read_map_header()):
-            name = unpacker.unpack()
-            found[name] = unpacker.unpack()
-            if name == "sequence":
-                return int(found["epoch"]), int(found["sequence"])
-    except (ValueError, TypeError, KeyError, msgpack.exceptions.UnpackException) as error:
-        raise MalformedError(f"no envelope: {error}") from error
-    raise MalformedError("no envelope")
 
 
 def _envelope(body: dict[str, Any]) -> Envelope:

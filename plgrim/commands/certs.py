@@ -58,13 +58,17 @@ def issue(
     authority = Authority(ca)
     chosen = tuple(process) if process else processes_of(role_named(role))
     for name in chosen:
-        hosts = ("localhost", "127.0.0.1", "router", *(host or ())) if name in ("router", "status") else ()
+        # "router": its name in the compose files, which no other process may listen under.
+        local = {"router": ("localhost", "127.0.0.1", "router"), "status": ("localhost", "127.0.0.1")}.get(
+            name
+        )
+        hosts = (*local, *(host or ())) if local else ()
         record = authority.issue(certificate_name(name, role, robot), out / name, hosts, days, renew)
         print(f"{record.name}  until {record.valid_until}  in {out / name}/")
     authority.trust(out)
     if owner is not None:
         for path in [out, *out.rglob("*")]:
-            os.chown(path, owner, owner)
+            os.chown(path, owner, owner, follow_symlinks=False)
     print(
         "give the new trusted.pem to every other host that has certificates: plgrim certs trust --out FOLDER"
     )

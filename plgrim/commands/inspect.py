@@ -57,16 +57,17 @@ def _print(text: str) -> None:
 
 
 def healthcheck(
-    service: Annotated[str, typer.Argument(help="A service, or router.")],
+    service: Annotated[str, typer.Argument(help="A service, link, or router.")],
     config_file: ConfigFile = None,
     timeout: Annotated[float, typer.Option(help="Wall seconds.")] = 3.0,
 ) -> None:
     """Ask a running service end to end whether it makes progress; exit 0 when it does."""
     from plgrim.config import load_config
-    from schemas.topics import SERVICES
+    from schemas.topics import LINK, SERVICES
 
-    if service not in (*SERVICES, "router"):
-        raise typer.BadParameter(f"no service {service!r}; there are {', '.join((*SERVICES, 'router'))}")
+    known = (*SERVICES, LINK, "router")
+    if service not in known:
+        raise typer.BadParameter(f"no service {service!r}; there are {', '.join(known)}")
     config = load_config(config_file)
     try:
         reason = _status_trouble(config) if service == "status" else _trouble(config, service, timeout)
@@ -94,7 +95,9 @@ def _trouble(config: Config, service: str, timeout_s: float) -> str:
     from plgrim.errors import NoRouterError
     from plgrim.runtime.health import ask_health
     from plgrim.runtime.zenoh_session import connect
+    from plgrim.security.exposure import check_client
 
+    check_client(config)
     try:
         with connect(config.router, config.robot, threading.Event(), timeout_s) as link:
             if service == "router":

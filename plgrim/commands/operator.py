@@ -35,8 +35,10 @@ def ask_mission(body: dict[str, Any] | None, config_file: Path | None) -> dict[s
     from plgrim.runtime.status_service import command_key
     from plgrim.runtime.zenoh_session import connect
     from plgrim.security.access import OPERATOR
+    from plgrim.security.exposure import check_client
 
     config = load_config(config_file)
+    check_client(config, OPERATOR)
     payload = b"" if body is None else json.dumps(body).encode()
     timeout_s = config.runtime.router_timeout_s
     with connect(config.router, config.robot, threading.Event(), timeout_s, OPERATOR) as link:

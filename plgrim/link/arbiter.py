@@ -20,7 +20,7 @@ from schemas.contract import SECOND_NS, Stamp, Topic
 from schemas.errors import MessageError, WrongSenderError
 from schemas.operation import StageHealth
 from schemas.policy import GlobalPolicy
-from schemas.topics import GLOBAL_IRM
+from schemas.world import GlobalIrm
 
 _GRAPH_VERSION = "irm_version"
 _WARM_NS = 2 * SECOND_NS
@@ -161,9 +161,8 @@ class Arbiter:
         return -1.0 if age_ns < 0 else age_ns / SECOND_NS
 
 
-def note_robot(seen: Seen, topic: Topic[Message], payload: bytes, mark: tuple[int, int], now_ns: int) -> None:
-    """Note what the robot has said; of the Global IRM also its version. Raises MessageError."""
-    seen.note(topic.name, mark, now_ns)
-    if topic.name == GLOBAL_IRM.name:
-        graph, _ = decode(payload, GLOBAL_IRM.message, topic.max_bytes)
-        seen.note(_GRAPH_VERSION, (0, graph.irm_version), now_ns)
+def note_robot(seen: Seen, topic: Topic[Message], message: Message, envelope: Envelope, now_ns: int) -> None:
+    """Note what the robot has said; of the Global IRM also its version."""
+    seen.note(topic.name, (envelope.epoch, envelope.sequence), now_ns)
+    if isinstance(message, GlobalIrm):
+        seen.note(_GRAPH_VERSION, (0, message.irm_version), now_ns)

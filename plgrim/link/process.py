@@ -20,17 +20,17 @@ from plgrim.link.lease import STANDBY
 from plgrim.link.routes import LANES, down, lane_of, up_plain
 from plgrim.link.uplink import Meters, Uplink, Wanted
 from plgrim.logs import get_logger
-from plgrim.runtime.mailbox import Mailbox, Outbox
+from plgrim.runtime.mailbox import Mailbox, Outbox, SharedDecoder
 from plgrim.runtime.service import LiveService
 from plgrim.security.exposure import check_link
 from schemas.base import Message
-from schemas.codec import peek
 from schemas.contract import SECOND_NS, Output, Stamp, Topic
-from schemas.errors import MessageError
 from schemas.operation import LinkReport
 from schemas.topics import LINK, LINK_REPORT
 
 _TICK_S = 0.1
+_STEP_S = 0.5
+"""What the supervisor is told: a busy machine may make it late, a stopped one is found all the same."""
 
 
 def run_link(config: Config, stop: threading.Event) -> None:
@@ -59,6 +59,7 @@ class LinkProcess:
             for name in config.link.leased
         }
         self._mailbox = Mailbox(config.robot, tuple(up_plain(config.link)))
+        self._sent_down = Mailbox(config.robot, tuple(down(config.link)))
         self._outbox = Outbox(config.robot, LINK, service.epoch)
         self._meters = Meters(Meter(), Meter())
         self._dropped: Counter[str] = Counter()
@@ -81,6 +82,7 @@ class LinkProcess:
                 link.declare(topic)
                 link.subscribe(topic, self._from_standby, instance=STANDBY)
         self._service.mailbox_report = self._health_report
+        self._service.monitor.expect(_STEP_S)
         self._service.monitor.ready = True
         get_logger().info("ready", base=self._link_config.endpoint, at_base=list(self._link_config.at_base))
         for uplink in self._uplinks.values():
@@ -116,15 +118,15 @@ class LinkProcess:
         get_logger().warning("lease granted", stage=arbiter.service, to=lease.holder, epoch=lease.epoch)
 
     def _from_robot(self, topic: Topic[Message], payload: bytes) -> None:
-        """What crosses: noted, and handed to its lane."""
-        try:
-            mark = peek(payload)
-            with self._lock:
-                note_robot(self._seen, topic, payload, mark, time.monotonic_ns())
-        except MessageError as error:
-            self._dropped[f"{topic.name}:{error.reason}"] += 1
-            return
-        self._uplinks[lane_of(topic)].offer(topic, payload)
+        """What crosses: noted, and handed to its lane. What no reader would take does not cross, and is counted."""
+        now_ns, read = time.monotonic_ns(), SharedDecoder()
+        with self._lock:
+            accepted = self._sent_down.accept(topic, payload, now_ns, read)
+            self._sent_down.stepped()
+            if accepted:
+                note_robot(self._seen, topic, *read(payload, topic.message, topic.max_bytes), now_ns)
+        if accepted:
+            self._uplinks[lane_of(topic)].offer(topic, payload)
 
     def _from_standby(self, topic: Topic[Message], payload: bytes) -> None:
         self._arbitrate(STANDBY, topic, payload)
@@ -162,6 +164,7 @@ class LinkProcess:
             for arbiter in self._arbiters.values():
                 found.update(arbiter.dropped)
             found.update(self._mailbox.dropped)
+            found.update(self._sent_down.dropped)
         for uplink in self._uplinks.values():
             found.update(uplink.counts()[1])
         return dict(sorted(found.items()))

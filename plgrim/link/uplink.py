@@ -18,7 +18,7 @@ from plgrim.errors import NoRouterError
 from plgrim.link.budget import Bucket, Meter
 from plgrim.link.lanes import Lane, Parcel
 from plgrim.link.routes import COMMANDS, MAPS, down, lane_of, needs_every
-from plgrim.logs import get_logger
+from plgrim.logs import Seldom, get_logger
 from plgrim.runtime.zenoh_session import Link, is_latched, open_session
 from schemas.base import Message
 from schemas.compact import compact
@@ -75,6 +75,7 @@ class Uplink:
         self._lane = make_lane(config, name)
         self._changed = threading.Condition()
         self._stop = threading.Event()
+        self._unsent = Seldom()
         self._publishers: dict[str, zenoh.Publisher | ext.AdvancedPublisher] = {}
         self._thread = threading.Thread(target=self._run, name=f"uplink {name}", daemon=True)
 
@@ -146,19 +147,27 @@ class Uplink:
 
     def _send(self, session: zenoh.Session, parcel: Parcel) -> None:
         topic = parcel.topic
-        publisher = self._publishers.get(topic.name) or self._declare(session, topic)
-        if isinstance(publisher, zenoh.Publisher) and not _is_heard(publisher):
-            return
-        small = compact(parcel.payload)
         try:
+            publisher = self._publishers.get(topic.name) or self._declare(session, topic)
+            if isinstance(publisher, zenoh.Publisher) and not _is_heard(publisher):
+                return
+            small = compact(parcel.payload)
             publisher.put(small)
-        except zenoh.ZError as error:
-            get_logger().warning("not sent to the base", topic=topic.name, error=str(error)[:200])
+        except Exception as error:  # whatever is wrong with one message: the lane goes on with the next
+            self._note_unsent(topic, error)
             return
         now_ns = time.monotonic_ns()
         with self._changed:
             self._lane.spent(topic.name, len(small), now_ns)
         self._meters.down.count(topic.name, len(small), now_ns)
+
+    def _note_unsent(self, topic: Topic[Message], error: Exception) -> None:
+        with self._changed:
+            self._lane.dropped[topic.name] += 1
+        if more := self._unsent.more(topic.name):
+            get_logger().warning(
+                "not sent to the base", topic=topic.name, error=repr(error)[:200], times=more
+            )
 
     def _declare(
         self, session: zenoh.Session, topic: Topic[Message]

@@ -19,6 +19,7 @@ from plgrim.recording.reader import read_raw
 from plgrim.recording.well_known import Shown, Translator
 from plgrim.runtime.router import check_port_free
 from plgrim.runtime.zenoh_session import connect
+from plgrim.security.exposure import check_client
 from schemas.base import Message
 from schemas.codec import decode
 from schemas.contract import SECOND_NS, Topic
@@ -83,6 +84,7 @@ def show_live(config: Config, server: FoxgloveServer, stop: threading.Event) -> 
         for one in shown:
             server.show(one, message.stamp_ns)
 
+    check_client(config)
     with connect(config.router, config.robot, stop, config.runtime.router_timeout_s) as link:
         for topic in (*TOPICS, *(health_topic(service) for service in SERVICES)):
             link.subscribe(topic, receive)

@@ -15,6 +15,7 @@ from plgrim.recording.transfer import Fetcher, Offer
 from plgrim.recording.well_known import Translator
 from plgrim.recording.writer import Ring, about
 from plgrim.runtime.zenoh_session import connect
+from plgrim.security.exposure import check_client
 
 _LEASE_MS = 20_000
 
@@ -30,8 +31,11 @@ def run_recorder(
 ) -> tuple[Counter[str], Counter[str]]:
     """Record into a folder until `stop`; messages by topic, and lost ones by reason.
 
-    base_endpoint: of the base station's router, where the segments are offered too. Raises NoRouterError.
+    base_endpoint: of the base station's router, where the segments are offered too. Raises NoRouterError, ConfigError.
     """
+    check_client(config)
+    if base_endpoint:
+        check_client(_at(config, base_endpoint))
     ring = Ring(folder, about(config.robot, config.seed, world_name(config)), segment_s, max_bytes)
     # A recorder that a busy machine keeps waiting is not gone.
     patient = config.router.model_copy(update={"lease_ms": max(config.router.lease_ms, _LEASE_MS)})
@@ -53,12 +57,17 @@ def run_recorder(
     return recorder.counts, recorder.lost
 
 
+def _at(config: Config, endpoint: str) -> Config:
+    """The configuration for a client of another router."""
+    return config.model_copy(update={"router": config.router.model_copy(update={"connect": endpoint})})
+
+
 class _BaseOffer(threading.Thread):
     """Offers a folder at the base's router, over a session of its own that waits for the base as long as it takes."""
 
     def __init__(self, config: Config, folder: Path, endpoint: str, stop: threading.Event) -> None:
         super().__init__(name="base offer", daemon=True)
-        self._router = config.router.model_copy(update={"connect": endpoint})
+        self._router = _at(config, endpoint).router
         self._robot, self._folder, self._ended = config.robot, folder, stop
         self.start()
 
@@ -80,6 +89,7 @@ def run_fetch(
 
     Raises NoRouterError.
     """
+    check_client(config)
     folder.mkdir(parents=True, exist_ok=True)
     missing = -1
     with connect(config.router, config.robot, stop, config.runtime.router_timeout_s) as link:

@@ -27,6 +27,8 @@ _NOT_DURABLE = frozenset({"sim"})
 _TRIES = 3
 """A state from which so many lives in a row did not get through their first steps is not restored once more."""
 _GOOD_STEPS = 3
+_EPOCHS_OF_A_LIFE = 10_000
+"""The link process begins a new epoch with every lease that it grants: its next life comes after all of these."""
 
 
 class Restorable(Protocol):
@@ -194,14 +196,15 @@ def _tell(stage: object) -> None:
 
 
 def next_epoch(config: RuntimeConfig, robot: str, service: str, now_ms: int) -> int:
-    """The epoch of a service's new life: the wall clock, ms, but always later than its last one.
+    """The epoch of a service's new life: the wall clock, ms, but always later than any of its last one.
 
     Readers refuse what comes from an epoch that is over: a wall clock that was set back must not silence a service.
     """
     if not config.state_dir:
         return now_ms
     path = Path(config.state_dir) / robot / f"{service}.epoch"
-    epoch = max(now_ms, _read_number(path) + 1)
+    last = _read_number(path)
+    epoch = max(now_ms, last + _EPOCHS_OF_A_LIFE if last else 0)
     _write_number(path, epoch)
     return epoch
 

@@ -26,7 +26,7 @@ class Reporter:
 
     def __init__(self, link: Link, config: Config) -> None:
         self._link = link
-        self._clock = MissionClock.of(config.clock)
+        self._clock = MissionClock.of(config.clock, config.runtime.state_dir)
         epoch = next_epoch(config.runtime, config.robot, "supervisor", time.time_ns() // 1_000_000)
         self._outbox = Outbox(config.robot, "supervisor", epoch)
         self._told: SupervisorReport | None = None

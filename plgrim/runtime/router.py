@@ -13,11 +13,14 @@ from plgrim.config import Config
 from plgrim.errors import PlgrimError, PortTakenError
 from plgrim.hosts import SECURE, host_and_port, protocol
 from plgrim.logs import get_logger
+from plgrim.runtime.pulse import Pulse
 from plgrim.runtime.zenoh_session import open_config, session_config
 from plgrim.security.access import ROUTER, every_topic
 from plgrim.security.exposure import check_router
 from plgrim.security.policy import router_access
 
+_LOOK_S = 0.5
+"""Between two looks at the certificates, and two beats of the pulse for the supervisor."""
 _MAX_SESSIONS = 128
 _FRAMING_BYTES = 1024 * 1024
 
@@ -80,13 +83,16 @@ def run_router(config: Config, stop: threading.Event) -> None:
     endpoints = [config.router.endpoint, *config.router.listen]
     for endpoint in endpoints:
         check_endpoint_free(endpoint)
+    pulse = Pulse.of_environment()
     while not stop.is_set():
         seen = _certificates_seen(settings)
         session = _open(config, settings, stop)
         get_logger().info("router listens", endpoints=endpoints, access_control="access_control" in settings)
         try:
-            while not stop.wait(0.5) and seen == _certificates_seen(settings):
-                pass
+            pulse.expect(_LOOK_S)
+            while not stop.wait(_LOOK_S) and seen == _certificates_seen(settings):
+                pulse.beat()
+                pulse.stepped()
         finally:
             session.close()  # type: ignore[no-untyped-call]
         if not stop.is_set():

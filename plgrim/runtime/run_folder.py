@@ -11,6 +11,7 @@ from typing import Any
 
 from plgrim.config import Config, load_config
 from plgrim.errors import ConfigError
+from plgrim.runtime.clock import boot_id
 from plgrim.runtime.durable import write_whole
 from plgrim.runtime.lock import Lock
 from schemas.contract import SECOND_NS
@@ -19,7 +20,6 @@ _CLOCK = "clock.json"
 _CLOCK_PERIOD_S = 1.0
 _MARGIN_S = 3.0
 """After a reboot the mission clock goes on so much after its last entry: never before what was said meanwhile."""
-_BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 
 def lock_run_folder(folder: Path) -> Lock:
@@ -69,14 +69,6 @@ def with_kept_state(folder: Path) -> Config:
 
 def _changed(config: Config, section: str, **values: Any) -> Config:
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
-
-
-def boot_id() -> str:
-    """Which boot of the machine this is; empty where that is not known."""
-    try:
-        return _BOOT.read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
 
 
 def _read_clock(path: Path) -> dict[str, Any]:

@@ -39,7 +39,7 @@ class LiveService:
     ) -> None:
         self.name = name
         self.config = config
-        self.clock = MissionClock.of(config.clock)
+        self.clock = MissionClock.of(config.clock, config.runtime.state_dir)
         self.epoch = next_epoch(config.runtime, config.robot, name, time.time_ns() // 1_000_000)
         self.monitor = monitor or HealthMonitor(name, pulse=Pulse.of_environment())
         self.mailbox_report: Callable[[Stamp], tuple[dict[str, int], list[str]]] = lambda _: ({}, [])

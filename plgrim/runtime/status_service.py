@@ -70,7 +70,7 @@ class StatusFeed:
 def run_status(config: Config, stop: threading.Event) -> None:
     """Serve the status until `stop`. Raises PortTakenError, NoRouterError, AlreadyRunningError, ConfigError."""
     options = cast(StatusConfig, check_service(config, "status"))
-    clock = MissionClock.of(config.clock)
+    clock = MissionClock.of(config.clock, config.runtime.state_dir)
     shared = app.SharedStatus(options, config.robot, clock.now_ns)
     shared.configuration = config.model_dump(mode="json")
     try:

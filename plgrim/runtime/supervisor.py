@@ -45,6 +45,13 @@ from schemas.errors import MessageError
 from schemas.operation import StageHealth
 from schemas.topics import SERVICES, SUPERVISOR, health_topic
 
+_LAST, _LAST_AFTER_S = "status", 10.0
+"""Started when all others are ready, or so much later: the robot drives without its page, and cores are few."""
+_SPARE_AFTER_S = 5.0
+"""A spare warms up when all have been ready for so long: not while their first plans need the cores."""
+_LONGEST_ROUND_S = 1.0
+"""Between two polls; more, and the supervisor was stopped, or starved."""
+
 __all__ = ["ROUTER", "Child", "Command", "Supervisor", "plgrim_command", "with_fresh_state"]
 
 
@@ -77,9 +84,11 @@ class Supervisor:
         self.children = {name: Child(name, logs / f"{name}.log") for name in (ROUTER, *services)}
         for child in self.children.values():
             child.log.unlink(missing_ok=True)
-        self.watch = Watch(run_folder / "pulse", services)
+        self.watch = Watch(run_folder / "pulse", (ROUTER, *services))
+        self._polled_s = time.monotonic()
+        self._whole_s: float | None = None
         self._clock_file = ClockFile(Path(self.config.runtime.state_dir))
-        self._clock = MissionClock.of(self.config.clock)
+        self._clock = MissionClock.of(self.config.clock, self.config.runtime.state_dir)
         environment = environment_of(run_folder / "config.yaml", None)
         with_spare = self.config.runtime.spare and command is plgrim_command
         self._spare = Spare(command, logs, environment) if with_spare else None
@@ -99,6 +108,7 @@ class Supervisor:
         check_endpoint_free(self.config.router.endpoint)
         write_config(self.config, self._folder / "config.yaml")
         self._spawn(self.children[ROUTER])
+        self._start_services()  # now: they load their modules while the router opens
         try:
             self.link = connect(
                 self.config.router, self.config.robot, threading.Event(), 15.0, SUPERVISOR.writer
@@ -110,9 +120,16 @@ class Supervisor:
         for child in self._services():
             instance = self.config.link.instance(child.name)
             self.link.subscribe(health_topic(child.name), self._hear, instance=instance)
-            self._spawn(child)
         self.watch.start()
         return self.link
+
+    def _start_services(self) -> None:
+        later = _LAST if len(self._services()) > 1 else ""
+        for child in self._services():
+            if child.name == later:
+                child.restart_at_s = time.monotonic() + _LAST_AFTER_S
+            else:
+                self._spawn(child)
 
     def _services(self) -> list[Child]:
         return [child for child in self.children.values() if child.name != ROUTER]
@@ -147,20 +164,37 @@ class Supervisor:
         `runtime.hold_failed_s` after a service has FAILED.
         """
         now = time.monotonic()
+        self._excuse(now)
+        waiting = self.waiting_for()
         for child in self.children.values():
             if child.process is None:
-                if child.restart_at_s is not None and now >= child.restart_at_s:
+                due = child.restart_at_s is not None and now >= child.restart_at_s
+                if due or (waiting == [_LAST] == [child.name] and not child.restarts and not child.failed):
                     self._spawn(child)
             elif child.process.poll() is not None:
                 self._ended(child, now)
-            elif child.name != ROUTER:
+            else:
                 self._look_after(child, child.process, now)
         self._clock_file.write(self._clock.now_ns())
         if self._reporter is not None:
             self._reporter.tell(self.children, self.watch.flagged())
-        if self._spare is not None and not self.waiting_for():
+        if waiting:
+            self._whole_s = None
+        elif self._whole_s is None:
+            self._whole_s = now
+        if self._spare is not None and self._whole_s is not None and now - self._whole_s >= _SPARE_AFTER_S:
             self._spare.keep()
         self._give_up_if_held_long(now)
+
+    def _excuse(self, now: float) -> None:
+        """While the supervisor itself stood still it heard nobody: that is nobody's silence."""
+        missed_s, self._polled_s = now - self._polled_s - _LONGEST_ROUND_S, now
+        if missed_s <= 0.0:
+            return
+        with self._lock:
+            for child in self.children.values():
+                child.heard_s += missed_s
+                child.started_s += missed_s
 
     def _look_after(self, child: Child, process: subprocess.Popen[bytes], now: float) -> None:
         why = self._sick(child, process, now)
@@ -182,6 +216,8 @@ class Supervisor:
         return ""
 
     def _is_unheard(self, child: Child, now: float) -> bool:
+        if child.name == ROUTER:  # it says nothing on the wire
+            return False
         with self._lock:
             heard = child.health is not None and child.process and child.health.pid == child.process.pid
             since = child.heard_s if heard else child.started_s
@@ -189,7 +225,7 @@ class Supervisor:
         return now - since > (limit if heard else max(limit, self.config.runtime.start_timeout_s))
 
     def _spawn(self, child: Child) -> None:
-        pulse = new_pulse(self._folder / "pulse" / child.name) if child.name != ROUTER else None
+        pulse = new_pulse(self._folder / "pulse" / child.name)
         child.restart_at_s, child.ready_s = None, None
         child.started_s = time.monotonic()
         changes = {VARIABLE: str(pulse or "")}

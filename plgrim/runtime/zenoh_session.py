@@ -34,6 +34,7 @@ _KEEP_ALL_CACHE = 64
 _LARGE_CACHE = 8
 _LARGE_BYTES = 1024 * 1024
 _OPEN_TIMEOUT_MS = 2000
+_SERVED_AT_ONCE = 8
 Receive = Callable[[Topic[Message], bytes], None]
 
 
@@ -271,16 +272,26 @@ class Link:
         self._spawn(f"query {key}", queryable.handler, lambda q: q.reply(q.key_expr, reply()))
 
     def serve(self, key: str, reply: Callable[[bytes], bytes]) -> None:
-        """Answer every query on a key with `reply(payload)`, each from a thread of its own: a reply may take long."""
+        """Answer every query on a key with `reply(payload)`, each from a thread of its own: a reply may take long.
+
+        What comes while so many are being answered gets an error at once: a flood costs neither memory nor threads.
+        """
         queryable = self.session.declare_queryable(key, zenoh.handlers.FifoChannel(16))
         self._keep.append(queryable)
+        free = threading.Semaphore(_SERVED_AT_ONCE)
 
         def work(query: Any) -> None:
-            payload = b"" if query.payload is None else query.payload.to_bytes()
-            query.reply(query.key_expr, reply(payload))
-            del query
+            try:
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                query.reply(query.key_expr, reply(payload))
+            finally:
+                del query
+                free.release()
 
         def spawn(query: Any) -> None:
+            if not free.acquire(blocking=False):
+                query.reply_err(b"busy")
+                return
             threading.Thread(target=work, args=(query,), name=f"serve {key}", daemon=True).start()
 
         self._spawn(f"serve {key}", queryable.handler, spawn)

@@ -7,6 +7,7 @@ missing in some kernels). The monotonic clock is the same on both, so that laten
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -15,8 +16,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 
+import psutil
 import pytest
 
+from plgrim.runtime.process import child_environment
 from tests.runtime.helpers import REPOSITORY
 
 ROBOT, BASE = "robot", "base"
@@ -40,6 +43,16 @@ def require_network() -> None:
         pytest.skip(f"no network namespaces or iptables here: {error}")
 
 
+def remove_left_behind() -> None:
+    """Remove the namespaces of runs that were killed: no process with the id in their names is alive."""
+    listed = subprocess.run(["ip", "netns", "list"], check=True, capture_output=True, text=True, timeout=30)
+    for line in listed.stdout.splitlines():
+        name = line.split()[0] if line.split() else ""
+        found = re.fullmatch(r"plgrim-(?:probe-)?(\d+)(?:-\w+)?", name)
+        if found is not None and not psutil.pid_exists(int(found[1])):
+            _run("ip", "netns", "del", name, check=False)
+
+
 class Network:
     """The two hosts; a context manager that kills what runs on them and removes them."""
 
@@ -49,6 +62,7 @@ class Network:
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def __enter__(self) -> Network:
+        remove_left_behind()
         for host, space in self._spaces.items():
             _run("ip", "netns", "add", space)
             self.on(host, "ip", "link", "set", "lo", "up")
@@ -107,7 +121,7 @@ class Network:
             process = subprocess.Popen(
                 self.command(host, sys.executable, *arguments),
                 cwd=REPOSITORY,
-                env={**os.environ, **environment, "PYTHONPATH": str(REPOSITORY)},
+                env={**child_environment({**os.environ, **environment}), "PYTHONPATH": str(REPOSITORY)},
                 stdout=file,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,

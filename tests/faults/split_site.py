@@ -10,13 +10,14 @@ from pathlib import Path
 
 from plgrim.config import load_config
 from plgrim.logs import configure_logs
-from plgrim.runtime.process import stop_on_signals
+from plgrim.runtime.process import die_with_parent, stop_on_signals
 from plgrim.runtime.supervisor import Supervisor
 
 
 def main() -> None:
     """Supervise until SIGTERM."""
     folder, services = Path(sys.argv[1]), tuple(sys.argv[2:])
+    die_with_parent()
     configure_logs("site")
     with stop_on_signals() as stop, Supervisor(load_config(), folder, services) as supervisor:
         supervisor.start()

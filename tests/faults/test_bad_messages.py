@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import psutil
 import pytest
+import zenoh
 
 from plgrim.config import Config
 from plgrim.runtime.health import ask_health
@@ -52,14 +54,17 @@ def test_a_live_service_refuses_and_counts_them_all(
     """Over Zenoh, to a process: the next few hundred follow when it has counted the last; it steps on all the while."""
     process = start(str(FAKES), "mission")
     eventually(lambda: _count(link) is not None, "it is ready")
-    key = COMMAND.key("robot")
+    writer: Any = link.session.declare_publisher(
+        COMMAND.key("robot"), congestion_control=zenoh.CongestionControl.BLOCK
+    )
+    eventually(lambda: writer.matching_status.matching, "the service's subscription is known here")
     for sequence in (1, 2):
-        link.session.put(key, good(COMMAND, "robot", 3, sequence))
+        writer.put(good(COMMAND, "robot", 3, sequence))
     sent, memory = 0, psutil.Process(process.pid)
     warm, source = 0, bad_messages(COMMAND, "robot", 3, 2, 1)
     while sent < COUNT:
         for _, payload in itertools.islice(source, 400):
-            link.session.put(key, payload)
+            writer.put(payload)
         sent += 400
         eventually(lambda: _count(link) == sent, f"all {sent} are counted")  # noqa: B023
         if sent == COUNT // 5:

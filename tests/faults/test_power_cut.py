@@ -17,6 +17,7 @@ import pytest
 
 from plgrim.config import load_config
 from plgrim.errors import ConfigError
+from plgrim.runtime.process import child_environment
 from plgrim.runtime.run_folder import ClockFile, with_fresh_state, with_kept_state
 from plgrim.runtime.zenoh_session import connect
 from schemas.topics import PLAN
@@ -73,7 +74,12 @@ def test_the_mission_clock_goes_on_after_a_reboot(tmp_path: Path, monkeypatch: p
 
 def _start(arguments: list[str], out: Path, wrap: tuple[str, ...] = ()) -> subprocess.Popen[bytes]:
     with (out.parent / "program.log").open("ab") as log:
-        return subprocess.Popen([*wrap, sys.executable, "-m", "plgrim", *arguments], stdout=log, stderr=log)
+        return subprocess.Popen(
+            [*wrap, sys.executable, "-m", "plgrim", *arguments],
+            stdout=log,
+            stderr=log,
+            env=dict(os.environ) if wrap else child_environment(os.environ),  # wrapped: another is its parent
+        )
 
 
 def _reboot(folder: Path) -> tuple[str, ...]:

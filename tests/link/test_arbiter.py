@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from plgrim.config import RuntimeConfig
 from plgrim.link.arbiter import Arbiter, ToPublish, note_robot
 from plgrim.link.config import LinkConfig
 from plgrim.link.in_step import Seen
 from plgrim.link.lease import BASE, STANDBY
+from plgrim.runtime.keeper import next_epoch
 from plgrim.runtime.mailbox import Mailbox
 from schemas.base import Message
 from schemas.codec import Envelope, decode, encode
@@ -55,13 +58,11 @@ class _World:
         self.odometry += 1
         self.version += 1
         self.graph_at_ms[self.version] = self.now_ms
-        moved = encode(odometry(now_ns, 0.0), Envelope("robot", "sim", 3, self.odometry, now_ns))
-        graph = encode(
-            global_irm(now_ns, self.version, self.version - 1),
-            Envelope("robot", "irm", 3, self.version, now_ns),
-        )
-        note_robot(self.seen, ODOMETRY, moved, (3, self.odometry), now_ns)
-        note_robot(self.seen, GLOBAL_IRM, graph, (3, self.version), now_ns)
+        graph = global_irm(now_ns, self.version, self.version - 1)
+        moved = Envelope("robot", "sim", 3, self.odometry, now_ns)
+        drawn = Envelope("robot", "irm", 3, self.version, now_ns)
+        note_robot(self.seen, ODOMETRY, odometry(now_ns, 0.0), moved, now_ns)
+        note_robot(self.seen, GLOBAL_IRM, graph, drawn, now_ns)
 
     def says(
         self,
@@ -238,3 +239,18 @@ def test_behind_is_measured_by_the_clock_of_the_robot_alone() -> None:
     assert seen.behind_ns("b", (1, 1), 30_000) == 0
     seen.note("a", (1, 7), 40_000)
     assert seen.behind_ns("a", (1, 1999), 50_000) == 0
+
+
+def test_a_link_that_restarts_after_the_clock_was_set_back_is_heard(tmp_path: Path) -> None:
+    """Its leases went on counting where the file of epochs does not: the next life must come after all of them."""
+    config = RuntimeConfig(state_dir=str(tmp_path))
+    epoch = next_epoch(config, "robot", "link", 3_600_000)
+    arbiter = Arbiter.of("gcp", "robot", CONFIG, Seen(), epoch)
+    for minute in range(40):
+        for second in (0, 1, 2, 20):
+            now_ns = (60 * minute + second) * SECOND_NS
+            if second < 20:
+                arbiter.lease.good(BASE, now_ns)
+            arbiter.lease.tick(now_ns)
+    assert arbiter.lease.epoch == epoch + 80
+    assert next_epoch(config, "robot", "link", 60_000) > arbiter.lease.epoch

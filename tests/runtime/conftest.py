@@ -13,6 +13,7 @@ from collections.abc import Iterator
 import pytest
 
 from plgrim.config import Config, RouterConfig, RuntimeConfig, load_config
+from plgrim.runtime.process import child_environment
 from plgrim.runtime.router import run_router
 from plgrim.runtime.zenoh_session import Link, connect
 from tests.runtime.helpers import REPOSITORY, Start
@@ -87,6 +88,7 @@ def start() -> Iterator[Start]:
         process = subprocess.Popen(
             [sys.executable, *arguments],
             cwd=REPOSITORY,
+            env=child_environment(os.environ),  # the kernel ends it when this process is killed
             text=True,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,

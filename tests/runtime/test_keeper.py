@@ -221,9 +221,9 @@ def test_no_folder_no_keeper(tmp_path: Path) -> None:
 def test_epochs_grow_even_when_the_wall_clock_is_set_back(tmp_path: Path) -> None:
     config = RuntimeConfig(state_dir=str(tmp_path))
     assert next_epoch(config, "robot", "irm", 1000) == 1000
-    assert next_epoch(config, "robot", "irm", 400) == 1001
+    assert next_epoch(config, "robot", "irm", 400) == 11_000
     assert next_epoch(config, "robot", "gcp", 400) == 400
-    assert next_epoch(config, "robot", "irm", 5000) == 5000
+    assert next_epoch(config, "robot", "irm", 50_000) == 50_000
     (tmp_path / "robot" / "irm.epoch").write_text("damaged", encoding="ascii")
     assert next_epoch(config, "robot", "irm", 6000) == 6000
     assert next_epoch(RuntimeConfig(), "robot", "irm", 7) == 7

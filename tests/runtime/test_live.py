@@ -277,6 +277,41 @@ def test_what_is_acknowledged_is_on_the_disk_before_it_is_said(
     assert on_disk == [[b"1"], [b"1", b"2"], [b"1", b"2", b"3"]]
 
 
+def test_a_flood_of_queries_is_answered_a_few_at_a_time(config: Config, link: Link) -> None:
+    """Whoever may ask could else have any number of threads wait in the service."""
+    go_on, lock = threading.Event(), threading.Lock()
+    now = most = 0
+
+    def reply(payload: bytes) -> bytes:
+        nonlocal now, most
+        with lock:
+            now += 1
+            most = max(most, now)
+        go_on.wait(20.0)
+        with lock:
+            now -= 1
+        return payload
+
+    link.serve("plgrim/test/question", reply)
+    with connect(config.router, config.robot, threading.Event(), 20.0) as other:
+        answers: list[bytes | None] = []
+
+        def ask() -> None:
+            answers.append(other.ask("plgrim/test/question", 20.0, b"?"))
+
+        threads = [threading.Thread(target=ask) for _ in range(40)]
+        for thread in threads:
+            thread.start()
+        eventually(lambda: len(answers) == 32, "most are sent away")
+        assert answers == [None] * 32
+        go_on.set()
+        for thread in threads:
+            thread.join()
+        assert most == 8
+        assert answers.count(b"?") == 8
+        eventually(lambda: other.ask("plgrim/test/question", 5.0, b"again") == b"again", "it answers again")
+
+
 @given(
     period=st.integers(1, 10**10),
     due=st.integers(0, 10**12),

@@ -6,7 +6,9 @@ import json
 import os
 import signal
 import socket
+import subprocess
 import threading
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -54,6 +56,25 @@ def test_all_become_ready_and_all_end(config: Config, tmp_path: Path) -> None:
     assert waited[-1] == []
     assert "ready" in (tmp_path / "logs" / "sim.log").read_text(encoding="utf-8")
     check_endpoint_free(config.router.endpoint)
+
+
+def test_the_page_starts_when_all_that_drives_is_ready(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot that resumes has two cores for nine processes; what it drives with has them first."""
+    monkeypatch.setattr("plgrim.runtime.supervisor._LAST_AFTER_S", 1e6)
+    services = ("status", "sim", "mission")
+    with Supervisor(config, tmp_path, services, fake_command({"status": "idle"})) as supervisor:
+        supervisor.start()
+        status, sim = supervisor.children["status"], supervisor.children["sim"]
+        assert [child.process is None for child in (status, sim)] == [True, False]
+        assert supervisor.wait_ready(threading.Event())
+        assert sim.ready_s is not None and status.started_s >= sim.ready_s
+        assert status.process is not None
+        os.kill(status.process.pid, signal.SIGKILL)
+        eventually(
+            lambda: status.restarted == 1 and status.ready, "it comes back like any other", supervisor.poll
+        )
 
 
 def test_a_killed_service_comes_back(config: Config, tmp_path: Path) -> None:
@@ -151,6 +172,47 @@ def test_a_killed_router_comes_back_and_the_services_find_it(config: Config, tmp
 
         eventually(goes_on, "health comes through the new router", supervisor.poll)
         assert sim.restarted == 0
+
+
+def test_a_stopped_router_is_replaced_and_no_service_with_it(config: Config, tmp_path: Path) -> None:
+    with _supervisor(config, tmp_path) as supervisor:
+        supervisor.start()
+        supervisor.wait_ready(threading.Event())
+        router, sim = supervisor.children["router"], supervisor.children["sim"]
+        stopped = router.process
+        assert stopped is not None
+        eventually(
+            lambda: supervisor.watch.silent_s("router", stopped.pid) > 0, "its pulse is seen", supervisor.poll
+        )
+        os.kill(stopped.pid, signal.SIGSTOP)
+        eventually(lambda: router.process not in (None, stopped), "another router runs", supervisor.poll)
+        steps = sim.health.steps if sim.health else 0
+
+        def goes_on() -> bool:
+            return sim.health is not None and sim.health.steps > steps + 20
+
+        eventually(goes_on, "health comes through it", supervisor.poll)
+        assert sim.restarted == 0
+
+
+def test_a_supervisor_that_stood_still_blames_nobody(config: Config, tmp_path: Path) -> None:
+    """It was stopped (SIGSTOP, a machine that hung) for longer than any service may be silent."""
+    supervisor = _supervisor(config, tmp_path)
+    with subprocess.Popen(["sleep", "600"], start_new_session=True) as sleeper:
+        try:
+            child = supervisor.children["sim"]
+            child.process = sleeper
+            silent_s = config.runtime.start_timeout_s + 60.0
+            child.started_s = child.heard_s = supervisor._polled_s = time.monotonic() - silent_s
+            supervisor.poll()
+            assert sleeper.poll() is None
+            child.started_s = child.heard_s = time.monotonic() - silent_s
+            supervisor.poll()
+            assert sleeper.wait(10.0) == -signal.SIGKILL
+        finally:
+            sleeper.kill()
+            child.process = None
+            supervisor.__exit__(None)
 
 
 @pytest.mark.parametrize("behaviour", ["exits", "failing"])

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from schemas.base import Message, Pose, columns_of
-from schemas.codec import decode, encode, peek
+from schemas.codec import decode, encode
 from schemas.compact import PREFIX, RULES, compact, is_compact
 from schemas.errors import (
     MalformedError,
@@ -23,7 +23,7 @@ from schemas.errors import (
     TooLargeError,
     ValueRangeError,
 )
-from schemas.topics import RISK_MAP, TOPICS
+from schemas.topics import RISK_MAP
 from schemas.world import GridHeader, RiskMap
 from tests.schemas.examples import ENVELOPE, MESSAGES, encoded
 
@@ -159,11 +159,3 @@ def test_any_bytes_under_a_good_checksum_are_refused(content: bytes) -> None:
     frame = zstandard.ZstdCompressor().compress(content)
     with pytest.raises(MessageError):
         decode(PREFIX + struct.pack(">Q", xxhash.xxh3_64_intdigest(frame)) + frame, RiskMap, LIMIT)
-
-
-def test_peek_reads_the_mark_without_the_rest() -> None:
-    for topic in TOPICS:
-        assert peek(encoded(topic.message)[:1034]) == (ENVELOPE.epoch, ENVELOPE.sequence)
-    for payload in (b"", b"\x92\xcf12345678", b"no message at all, but longer than ten"):
-        with pytest.raises(MalformedError):
-            peek(payload)

@@ -51,6 +51,31 @@ def test_each_container_has_its_own_certificate_read_only(role: Role) -> None:
         assert len(mounts) == 1 and default(mounts[0]).startswith(f"../certs/{role}/{name}:"), name
 
 
+@pytest.mark.parametrize("role", ["robot", "base"])
+def test_whatever_has_an_epoch_keeps_it(role: Role) -> None:
+    """Without the volume a link that restarts with a clock set back is refused by all who heard its last life."""
+    for name, service in composed(role).items():
+        assert name == "router" or "state:/var/lib/plgrim" in service["volumes"], name
+
+
+@pytest.mark.parametrize("role", ["all", "robot", "base"])
+def test_health_checks_ask_about_the_service_of_their_container(role: Role) -> None:
+    checks = {
+        name: service.get("healthcheck", {}).get("test", []) for name, service in composed(role).items()
+    }
+    for name, check in checks.items():
+        if name not in ("router", "explore"):
+            assert check == ["CMD", "plgrim", "healthcheck", name]
+
+
+def test_a_router_that_dies_does_not_end_the_services() -> None:
+    """systemd restarts whatever `Requires` a unit along with it."""
+    for unit in (ROOT / "deploy" / "systemd").glob("*.service"):
+        assert not re.search(r"^(Requires|BindsTo)=", unit.read_text(encoding="utf-8"), re.MULTILINE), (
+            unit.name
+        )
+
+
 @pytest.mark.parametrize("role", ["all", "robot", "base"])
 def test_what_is_published_has_tls_or_is_for_this_host_alone(role: Role) -> None:
     for name, service in composed(role).items():

@@ -44,6 +44,22 @@ def test_connections_to_other_hosts_need_tls() -> None:
 
 
 @pytest.mark.parametrize(
+    "option", ["enable_mtls=false", "so_sndbuf=8192;root_ca_certificate_file=/tmp/mine.pem"]
+)
+def test_options_behind_an_endpoint_cannot_take_tls_away(option: str) -> None:
+    """Zenoh prefers them to its configuration: with the first, a stranger without a certificate was let in."""
+    open_to_all = f"tls/0.0.0.0:7447#{option}"
+    for router in ({"endpoint": open_to_all}, {"listen": [open_to_all]}):
+        with pytest.raises(ExposedError, match="could take the protection away"):
+            check_router(load_config(overrides={"router": router}))
+    with pytest.raises(ExposedError, match=r"router\.connect"):
+        check_client(load_config(overrides={"router": {"connect": f"tls/base:7457#{option}"}}), "gcp")
+    with pytest.raises(ExposedError, match=r"link\.endpoint"):
+        check_link(load_config(overrides={"link": {"endpoint": f"tls/base:7447#{option}", "host": "robot"}}))
+    check_router(load_config(overrides={"router": {"endpoint": "tcp/127.0.0.1:7457#so_sndbuf=8192"}}))
+
+
+@pytest.mark.parametrize(
     ("published", "refused"), [("none", False), ("127.0.0.1", False), ("0.0.0.0", True), ("", True)]
 )
 def test_a_container_is_as_open_as_it_is_published(published: str, refused: bool) -> None:
@@ -63,6 +79,26 @@ def test_a_container_is_as_open_as_it_is_published(published: str, refused: bool
 def test_an_open_status_page_is_refused() -> None:
     with pytest.raises(ExposedError, match=r"status\.host: 0\.0\.0\.0 .*no TLS"):
         check_host(load_config(overrides={"status": {"host": "0.0.0.0"}}))
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["pause"], ["fences"], ["watch"], ["healthcheck", "gcp"], ["record"], ["fetch"]],
+    ids=" ".join,
+)
+def test_tools_do_not_talk_to_another_host_in_the_clear(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PLGRIM_ROUTER", "tcp/192.0.2.1:7457")
+    result = CliRunner().invoke(application, command)
+    assert isinstance(result.exception, ExposedError), result.output
+
+
+def test_a_recorder_does_not_offer_its_segments_in_the_clear(tmp_path: Path) -> None:
+    arguments = ["record", "--out", str(tmp_path), "--base", "tcp/192.0.2.1:7447"]
+    result = CliRunner().invoke(application, arguments)
+    assert isinstance(result.exception, ExposedError), result.output
 
 
 @pytest.mark.parametrize("command", [["router"], ["up"], ["run", "gcp"]])

@@ -342,6 +342,7 @@ def test_a_polygon_can_be_drawn_with_the_keyboard_alone(open_page: Callable[...,
 def test_every_control_is_reached_by_the_tab_key_and_named(open_page: Callable[..., Any]) -> None:
     page = open_page()
     until(page, MAP_SHOWN)
+    until(page, "!document.querySelector('#command-pause').disabled")
     reached = []
     for _ in range(60):
         page.keyboard.press("Tab")

@@ -84,7 +84,7 @@ def test_every_control_does_to_the_mission_what_it_says(page: Any, behind: Missi
     until(page, "document.querySelectorAll('.fences li').length === 1")
     _draw(page, "geofence", 0.2, 0.65)
     until(page, "document.querySelectorAll('.fences li').length === 2")
-    assert page.evaluate("plgrim.store.get('status').mission.fences_version") == 2
+    until(page, "plgrim.store.get('status').mission.fences_version === 2")
     page.click("button[aria-label^='Remove No-go']")
     until(page, "document.querySelectorAll('.fences li').length === 1")
     behind.x_m = 4.0  # it drove on
