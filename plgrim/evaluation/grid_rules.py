@@ -15,8 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from plgrim.errors import PlgrimError
 from planning.clusters import label_components
+from plgrim.errors import PlgrimError
 from plgrim.evaluation.grid_kernels import (
     OPEN,
     SOLID,

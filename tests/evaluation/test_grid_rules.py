@@ -202,7 +202,8 @@ def counted(world: DareWorld) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDA
     cells, place = world.frontier()
     seen = np.zeros((len(world.node), len(cells)), np.bool_)
     in_sight(world.belief, world.node, cells, world.place, place, world.utility_range, seen)
-    return cells, seen.any(axis=0), seen[world.utility > 0].any(axis=0)
+    counts = np.asarray(seen[world.utility > 0].any(axis=0), np.bool_)
+    return cells, np.asarray(seen.any(axis=0), np.bool_), counts
 
 
 def test_what_a_useful_node_counts_stays_unseen_and_the_rest_of_the_frontier_is_shut() -> None:
@@ -224,6 +225,17 @@ def test_what_a_useful_node_counts_stays_unseen_and_the_rest_of_the_frontier_is_
         alone = [c for c, s in zip(cells.tolist(), in_view & ~counts, strict=True) if s]
         assert len(left & {tuple(c) for c in alone}) < max(1, len(alone))
     assert shut > 0
+
+
+def test_ariadne_shuts_openings_that_lead_to_less_than_may_stay_unseen() -> None:
+    world = make_world(room_map("ariadne"), "ariadne")
+    assert isinstance(world, AriadneWorld)
+    world.belief[:60], world.belief[60:] = SOLID, OPEN
+    world.belief[40:60, 40:48] = UNSEEN  # two blocks wide
+    world.belief[40:60, 80:120] = UNSEEN
+    shut = world.belief_of_use() != world.belief
+    assert shut[59, 40:48].all()
+    assert not shut[:, 80:120].any()
 
 
 def test_dare_nodes_are_multiples_of_four_metres_from_the_start() -> None:
