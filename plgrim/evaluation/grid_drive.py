@@ -161,7 +161,9 @@ def drive(world: GridWorld, rules: Rules, parameters: ExplorerConfig, most_moves
     while not world.done and world.moves < most_moves:
         x_m, y_m = ((world.node[world.at] + 0.5) * cell_m).tolist()
         began = time.perf_counter()
-        plan = explorer.step(Grid(occupancy(world.belief, block), cell_m * block), (x_m, y_m, yaw), seconds)
+        plan = explorer.step(
+            Grid(occupancy(world.belief_of_use(), block), cell_m * block), (x_m, y_m, yaw), seconds
+        )
         plan_s.append(time.perf_counter() - began)
         if plan.finished and not over:
             over = True

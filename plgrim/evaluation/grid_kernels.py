@@ -169,3 +169,22 @@ def connected_open(belief: NDArray[np.uint8], x0: int, y0: int) -> NDArray[np.bo
                     stack[top] = r * width + c
                     top += 1
     return found
+
+
+@njit
+def without_settled(belief: NDArray[np.uint8], open_border: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The belief with those unseen cells SOLID that touch (8) known free cells, none of them of the open border."""
+    height, width = belief.shape
+    out = belief.copy()
+    for row in range(height):
+        for column in range(width):
+            if belief[row, column] != UNSEEN:
+                continue
+            beside, is_open = False, False
+            for r in range(max(0, row - 1), min(height, row + 2)):
+                for c in range(max(0, column - 1), min(width, column + 2)):
+                    beside = beside or belief[r, c] == OPEN
+                    is_open = is_open or open_border[r, c]
+            if beside and not is_open:
+                out[row, column] = SOLID
+    return out

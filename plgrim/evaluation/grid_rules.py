@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.clusters import label_components
 from plgrim.errors import PlgrimError
 from plgrim.evaluation.grid_kernels import (
     OPEN,
@@ -26,6 +27,7 @@ from plgrim.evaluation.grid_kernels import (
     in_sight,
     open_lines,
     scan,
+    without_settled,
 )
 
 Rules = Literal["ariadne", "dare"]
@@ -138,6 +140,10 @@ class GridWorld(ABC):
     @abstractmethod
     def done(self) -> bool:
         """Whether the protocol calls the map explored."""
+
+    def belief_of_use(self) -> NDArray[np.uint8]:
+        """What is known, with unseen cells that no node's utility counts any more SOLID; not to be changed."""
+        return self.belief
 
     def unseen_cells(self) -> int:
         """Free cells of the truth that are not known to be."""
@@ -255,6 +261,19 @@ class AriadneWorld(GridWorld):
             self._ended[i] = self._ended[i] or len(seen) <= self.min_utility
             self.utility[i] = 0 if self._ended[i] else len(seen)
 
+    def belief_of_use(self) -> NDArray[np.uint8]:
+        """Openings that lead to less than what may stay unseen are shut: w cells wide, they lead to w x w or so."""
+        cells = self.frontier()
+        mask = np.zeros((self.truth.shape[0] // 4 + 1, self.truth.shape[1] // 4 + 1), np.bool_)
+        mask[cells[:, 1] // 4, cells[:, 0] // 4] = True
+        labels = np.zeros(mask.shape, np.int32)
+        pieces = label_components(mask, labels)
+        wide = np.bincount(labels.ravel(), minlength=pieces + 1) * 4
+        open_border = np.zeros(self.belief.shape, np.bool_)
+        for y, x in np.argwhere(mask & (wide[labels] ** 2 > _ENOUGH_CELLS)).tolist():
+            open_border[max(0, 4 * y - 4) : 4 * y + 8, max(0, 4 * x - 4) : 4 * x + 8] = True
+        return without_settled(self.belief, open_border)
+
     def _sight(self, cells: NDArray[np.int64], part: slice) -> NDArray[np.bool_]:
         seen = np.zeros((len(self.node[part]), len(cells)), np.bool_)
         in_sight(
@@ -297,6 +316,7 @@ class DareWorld(GridWorld):
         inside = np.all((self._cell >= 0) & (self._cell < [width, height]), axis=1)
         self._index, self._cell = self._index[inside], self._cell[inside]
         self._visited: set[tuple[int, ...]] = set()
+        self._open_border: NDArray[np.int64] = np.zeros((0, 2), np.int64)
         self.node = np.array([grid.start], np.int64)
         self.look()
         self.update()
@@ -315,27 +335,46 @@ class DareWorld(GridWorld):
         self.edges = {}
         for a, b in pairs[free].tolist():
             self.edges.setdefault(a, {})[b] = math.dist(self.place[a], self.place[b])
-        frontier, place = self.frontier()
-        seen = np.zeros((len(self.node), len(frontier)), np.bool_)
-        in_sight(self.belief, self.node, frontier, self.place, place, self.utility_range, seen)
+        cells, place, voxel, chosen = self._voxels()
+        seen = np.zeros((len(self.node), len(chosen)), np.bool_)
+        in_sight(
+            self.belief, self.node, cells[chosen], self.place, place[chosen], self.utility_range, seen
+        )  # fmt: skip
         count = np.count_nonzero(seen, axis=1)
         self._visited.add((x, y))
         visited = [tuple(c) in self._visited for c in self.node.tolist()]
         count[(count <= self.min_utility) | np.array(visited)] = 0
         self.utility = count.astype(np.int64)
+        settled = seen.any(axis=0) & ~seen[count > 0].any(axis=0)
+        self._open_border = cells[~settled[voxel]]
+
+    def belief_of_use(self) -> NDArray[np.uint8]:
+        """Of the frontier, what nodes see but none with any utility does is settled: a single voxel, or all visited."""
+        open_border = np.zeros(self.belief.shape, np.bool_)
+        open_border[self._open_border[:, 1], self._open_border[:, 0]] = True
+        return without_settled(self.belief, open_border)
 
     def frontier(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """(m, 2) cells and places of frontier points: of each voxel of 1.6 m the point nearest to its corner."""
+        cells, place, _, chosen = self._voxels()
+        return cells[chosen], place[chosen]
+
+    def _voxels(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+        """All frontier cells (n, 2) and their places; (n,) the voxel of each; (m,) the cell that stands for a voxel."""
         cells = frontier_cells(self.belief)
         place = np.around(cells * 0.4 + self._origin, 1)
-        voxel = (place / self.voxel).astype(np.int64)
-        away = np.linalg.norm(place - voxel * self.voxel, axis=1)
-        best: dict[tuple[int, int], int] = {}
-        for i, key in enumerate(map(tuple, voxel.tolist())):
-            if key not in best or away[i] < away[best[key]]:
-                best[key] = i
-        chosen = np.array(list(best.values()), np.int64)
-        return cells[chosen], place[chosen]
+        key = (place / self.voxel).astype(np.int64)
+        away = np.linalg.norm(place - key * self.voxel, axis=1)
+        number: dict[tuple[int, ...], int] = {}
+        best: list[int] = []
+        voxel = np.zeros(len(cells), np.int64)
+        for i, k in enumerate(map(tuple, key.tolist())):
+            voxel[i] = number.setdefault(k, len(number))
+            if voxel[i] == len(best):
+                best.append(i)
+            elif away[i] < away[best[voxel[i]]]:
+                best[voxel[i]] = i
+        return cells, place, voxel, np.array(best, np.int64)
 
     @property
     def done(self) -> bool:

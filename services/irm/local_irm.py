@@ -15,6 +15,7 @@ from planning.sight import visible_mass_over
 from schemas.base import Pose
 from schemas.world import LocalIrm
 from services.irm.config import Config
+from services.irm.glimpses import add_glimpses
 from services.irm.lattice import choose_anchors, connect_neighbours, halve, halve_heights, sum_patches
 from services.irm.window import Window
 
@@ -53,6 +54,7 @@ class LocalIrmBuilder:
         entropy = self._patch_sum(window, counted, ix0, iy0, window.uncovered)[0].astype(np.float32)
         entropy[entropy < c.min_node_entropy] = 0.0
         reach = math.ceil(c.sensor_range_m / c.spacing_m)
+        visible = self._visible(window, anchor, state, entropy, ix0, iy0, reach)
         self.version += 1
         return LocalIrm(
             stamp_ns=stamp_ns,
@@ -77,7 +79,7 @@ class LocalIrmBuilder:
             bent_edge=bent_edge[:bent],
             bent_start=bent_start[: bent + 1],
             bent_xy=bent_xy[: bent_start[bent]],
-            visible=self._visible(window, anchor, state, entropy, ix0, iy0, reach),
+            visible=visible,
         )
 
     def state(self) -> list[list[float]]:
@@ -137,6 +139,7 @@ class LocalIrmBuilder:
         iy0: int,
         reach: int,
     ) -> NDArray[np.uint32]:
+        """What each node sees; with `coverage: known` entropy is changed to what can be seen at all."""
         c, s = self.config, window.spec
         # Halves of even global index, so that what a node sees does not change as the window rolls.
         skip_x, skip_y = s.ix0 % 2, s.iy0 % 2
@@ -154,16 +157,30 @@ class LocalIrmBuilder:
             halve_heights(window.elevation_m[part], window.top_m[part], ground, top)
         rows = np.zeros((c.size * c.size, 2 * reach + 1), np.uint32)
         res = 2.0 * s.resolution_m
-        column = np.floor(((ix + 2 * np.arange(half[1]) + 1.0) * s.resolution_m) / c.spacing_m) - ix0
-        row = np.floor(((iy + 2 * np.arange(half[0]) + 1.0) * s.resolution_m) / c.spacing_m) - iy0
-        patch = row[:, None] * c.size + column[None, :]
-        outside = ((row < 0) | (row >= c.size))[:, None] | ((column < 0) | (column >= c.size))[None, :]
-        patch[outside] = -1
+        patch = self._patches(*half, ix // 2, iy // 2, res, ix0, iy0)
         visible_rows(
-            opaque, ground, top, mass, patch.astype(np.int32), ix * s.resolution_m, iy * s.resolution_m, res,
+            opaque, ground, top, mass, patch, ix * s.resolution_m, iy * s.resolution_m, res,
             c.sensor_range_m, c.sensor_height_m, c.size, reach, state, anchor, entropy > 0.0, rows,
         )  # fmt: skip
+        if c.coverage == "known" and window.top_m is None:
+            patch = self._patches(s.height, s.width, s.ix0, s.iy0, s.resolution_m, ix0, iy0)
+            add_glimpses(
+                hides, window.entropy * window.uncovered, patch, s.ix0 * s.resolution_m, s.iy0 * s.resolution_m,
+                s.resolution_m, c.sensor_range_m, c.size, reach, state, anchor, entropy, rows,
+            )  # fmt: skip
         return rows
+
+    def _patches(
+        self, height: int, width: int, first_x: int, first_y: int, resolution_m: float, ix0: int, iy0: int
+    ) -> NDArray[np.int32]:
+        """The node whose patch holds the centre of each cell of a grid, (h, w); -1 outside the lattice."""
+        size, spacing_m = self.config.size, self.config.spacing_m
+        column = np.floor((first_x + np.arange(width) + 0.5) * resolution_m / spacing_m) - ix0
+        row = np.floor((first_y + np.arange(height) + 0.5) * resolution_m / spacing_m) - iy0
+        patch = row[:, None] * size + column[None, :]
+        outside = ((row < 0) | (row >= size))[:, None] | ((column < 0) | (column >= size))[None, :]
+        patch[outside] = -1
+        return np.asarray(patch, np.int32)
 
 
 @njit

@@ -64,6 +64,13 @@ class TourConfig(BaseModel):
         le=1000,
         description="Metres of way that a nat is worth for each metre that it is seen earlier; 0: the shortest tour.",
     )
+    stop_gain: float = Field(
+        0.0,
+        ge=0,
+        le=100,
+        description="Every stop counts so many nats more in the order: the way back to one that was left behind grows "
+        "with what is found meanwhile.",
+    )
     near_m: float = Field(
         24.0, gt=0, le=1e6, description="Viewpoints are chosen by gain^power exp(-way / this), m,"
     )

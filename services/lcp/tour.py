@@ -20,6 +20,7 @@ from planning.lattice_graph import travel_costs
 from schemas.policy import GlobalPolicy
 from schemas.world import LocalIrm
 from services.lcp.config import TourConfig
+from services.lcp.problem import node_at
 
 _ONE = np.uint64(1)
 Floats = NDArray[np.float64]
@@ -66,7 +67,7 @@ def plan_tour(
     for k in range(count):
         away = _costs(irm, int(stops.node[k]), risk_weight_m, max_risk)
         leg[k] = stops.beyond_m[k] + away[stops.node] + stops.beyond_m
-    found = latency_tour(leg, stops.gain, config.early_per_nat)
+    found = latency_tour(leg, stops.gain + config.stop_gain, config.early_per_nat)
     order = [int(stops.node[k]) for k in found.order]
     return Tour(order, float(found.first_cost.min()), float(stops.gain.sum()))
 
@@ -93,17 +94,19 @@ def _stops(irm: LocalIrm, start: int, entropy: Floats, cost: Floats, config: Tou
 def _beyond(
     irm: LocalIrm, start: int, policy: GlobalPolicy | None, cost: Floats, config: TourConfig, taken: int
 ) -> Stops:
-    """The frontiers that gcp has weighed and that lie outside the window."""
+    """The frontiers that gcp has weighed and that lie where the Local IRM shows no ground.
+
+    The risk map under it may be smaller than the lattice.
+    """
     nodes, gains, beyond_m = [], [], []
     usable = np.flatnonzero(np.isfinite(cost) & (irm.state == 1))
     if policy is not None and len(usable) > 1:
         to_odom = planar(policy.map_to_odom).inverse()
-        half_m = 0.5 * irm.size * irm.spacing_m
-        middle = (np.array([irm.ix0, irm.iy0]) * irm.spacing_m) + half_m
         for other in policy.alternatives[: max(0, config.stops - taken)]:
             place = np.array(to_odom.apply(other.x_m, other.y_m))
-            if np.abs(place - middle).max() < half_m:
-                continue
+            here = node_at(irm, *place.tolist())
+            if here >= 0 and irm.state[here] == 1:
+                continue  # the Local IRM knows better what is left there
             away_m = np.hypot(*(irm.anchor_m[usable] - place).T)
             best = int(np.argmin(cost[usable] + config.detour * away_m))
             if usable[best] != start:

@@ -20,8 +20,10 @@ from plgrim.evaluation.grid_kernels import (
     block_minimum,
     connected_open,
     frontier_cells,
+    in_sight,
     is_open_line,
     scan,
+    without_settled,
 )
 from plgrim.evaluation.grid_peers import best_node, discounted_utility, explore, nearest
 from plgrim.evaluation.grid_rules import (
@@ -31,6 +33,7 @@ from plgrim.evaluation.grid_rules import (
     MapError,
     ariadne_map,
     dare_map,
+    first_move,
     make_world,
     ray_ends,
     read_map,
@@ -174,6 +177,65 @@ def test_simple_rules_end_with_the_map_known(rules: str, rule: object) -> None:
     assert np.array_equal(world.belief[world.belief != UNSEEN], world.truth[world.belief != UNSEEN])
     goal, _ = best_node(world, nearest)
     assert goal < 0 or isinstance(world, AriadneWorld)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.6), st.floats(0.0, 0.3))
+@settings(max_examples=40, deadline=None)
+def test_unseen_cells_beside_settled_ground_alone_become_walls(
+    seed: int, unseen: float, open_share: float
+) -> None:
+    random = np.random.default_rng(seed)
+    belief = np.where(random.random((9, 12)) < unseen, UNSEEN, OPEN).astype(np.uint8)
+    belief[random.random(belief.shape) < 0.2] = SOLID
+    open_border = (random.random(belief.shape) < open_share) & (belief == OPEN)
+    found = without_settled(belief, open_border)
+    for row, column in np.ndindex(belief.shape):
+        around = (slice(max(0, row - 1), row + 2), slice(max(0, column - 1), column + 2))
+        shut = (
+            belief[row, column] == UNSEEN and (belief[around] == OPEN).any() and not open_border[around].any()
+        )
+        assert found[row, column] == (SOLID if shut else belief[row, column])
+
+
+def counted(world: DareWorld) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Frontier points (m, 2), whether any node sees each, and whether one with any utility does."""
+    cells, place = world.frontier()
+    seen = np.zeros((len(world.node), len(cells)), np.bool_)
+    in_sight(world.belief, world.node, cells, world.place, place, world.utility_range, seen)
+    counts = np.asarray(seen[world.utility > 0].any(axis=0), np.bool_)
+    return cells, np.asarray(seen.any(axis=0), np.bool_), counts
+
+
+def test_what_a_useful_node_counts_stays_unseen_and_the_rest_of_the_frontier_is_shut() -> None:
+    world = make_world(room_map("dare"), "dare")
+    assert isinstance(world, DareWorld)
+    shut = 0
+    while not world.done:
+        goal, before = best_node(world, nearest)
+        world.move(first_move(before, world.at, goal))
+        given = world.belief_of_use()
+        changed = given != world.belief
+        assert np.all(world.belief[changed] == UNSEEN)
+        assert np.all(given[changed] == SOLID)
+        shut += int(changed.sum())
+        cells, in_view, counts = counted(world)
+        for x, y in cells[counts].tolist():
+            assert not changed[y - 1 : y + 2, x - 1 : x + 2].any()
+        left = {tuple(c) for c in frontier_cells(given).tolist()}
+        alone = [c for c, s in zip(cells.tolist(), in_view & ~counts, strict=True) if s]
+        assert len(left & {tuple(c) for c in alone}) < max(1, len(alone))
+    assert shut > 0
+
+
+def test_ariadne_shuts_openings_that_lead_to_less_than_may_stay_unseen() -> None:
+    world = make_world(room_map("ariadne"), "ariadne")
+    assert isinstance(world, AriadneWorld)
+    world.belief[:60], world.belief[60:] = SOLID, OPEN
+    world.belief[40:60, 40:48] = UNSEEN  # two blocks wide
+    world.belief[40:60, 80:120] = UNSEEN
+    shut = world.belief_of_use() != world.belief
+    assert shut[59, 40:48].all()
+    assert not shut[:, 80:120].any()
 
 
 def test_dare_nodes_are_multiples_of_four_metres_from_the_start() -> None:

@@ -32,6 +32,13 @@ def test_early_gain_decides_where_it_begins(early: float, first: list[int]) -> N
     assert found.root_value == pytest.approx(float(found.path_reward.sum()))
 
 
+@pytest.mark.parametrize(("stop_gain", "first"), [(0.0, 5), (20.0, 3)])
+def test_what_each_stop_counts_more_brings_a_crumb_nearby_forward(stop_gain: float, first: int) -> None:
+    lattice = row_of(SIZE, {2: 0.2, 8: 0.69, 9: 0.69, 10: 0.69})
+    tour = {"early_per_nat": 2.0, "stop_gain": stop_gain}
+    assert columns(Bench(lattice, "tour", tour=tour).ask(4))[1] == first
+
+
 def test_a_crumb_is_left_until_there_is_nothing_else() -> None:
     crumb = row_of(SIZE, {2: 0.05})
     assert columns(Bench(crumb, "tour").ask(4))[:2] == [4, 3]
