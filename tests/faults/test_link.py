@@ -62,7 +62,7 @@ class Site:
         base = f"tcp/{network.address(BASE)}:7447"
         shared = {
             "PLGRIM_RUNTIME__ROUTER_TIMEOUT_S": "60",
-            "PLGRIM_DEPLOYMENT__PRIVATE_NETWORK": "true",  # two namespaces and a cable between them
+            "PLGRIM_DEPLOYMENT__PUBLISHED_ON": "none",  # two namespaces and a cable between them
             "PLGRIM_LINK__ENDPOINT": base,
             **{f"PLGRIM_LINK__{name}": value for name, value in (link or {}).items()},
         }
