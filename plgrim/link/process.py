@@ -5,6 +5,7 @@ Threads: one a subscription (at either router), one a lane to send, this one to 
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from collections import Counter
@@ -29,6 +30,8 @@ from schemas.operation import LinkReport
 from schemas.topics import LINK, LINK_REPORT
 
 _TICK_S = 0.1
+_MOST_UNSAID = 512
+"""Messages for the robot that may wait; far more than come while a session stands still."""
 _STEP_S = 0.5
 """What the supervisor is told: a busy machine may make it late, a stopped one is found all the same."""
 
@@ -63,6 +66,7 @@ class LinkProcess:
         self._outbox = Outbox(config.robot, LINK, service.epoch)
         self._meters = Meters(Meter(), Meter())
         self._dropped: Counter[str] = Counter()
+        self._unsaid: queue.Queue[tuple[Topic[Message], bytes] | None] = queue.Queue(_MOST_UNSAID)
         self._uplinks = {
             lane: Uplink(lane, config, self._wanted(lane), self._from_base, self._meters) for lane in LANES
         }
@@ -85,11 +89,14 @@ class LinkProcess:
         self._service.monitor.expect(_STEP_S)
         self._service.monitor.ready = True
         get_logger().info("ready", base=self._link_config.endpoint, at_base=list(self._link_config.at_base))
+        speaker = threading.Thread(target=self._speak, name="to the robot", daemon=True)
+        speaker.start()
         for uplink in self._uplinks.values():
             uplink.start()
         try:
             self._step_until(stop)
         finally:
+            self._say(None)
             for uplink in self._uplinks.values():
                 uplink.stop()
 
@@ -144,7 +151,7 @@ class LinkProcess:
     def _arbitrate(self, instance: str, topic: Topic[Message], payload: bytes) -> None:
         arbiter = self._arbiters[topic.writer]
         stamp = self._service.clock.now_ns()
-        with self._lock:  # published under the lock: in the order of their sequence numbers
+        with self._lock:  # handed over under the lock: in the order of their sequence numbers
             before = arbiter.lease.holder
             self._publish(arbiter.receive(instance, topic, payload, time.monotonic_ns(), stamp))
         if arbiter.lease.holder != before:
@@ -152,6 +159,22 @@ class LinkProcess:
 
     def _publish(self, found: ToPublish) -> None:
         for topic, payload in found:
+            if not self._say((topic, payload)):
+                self._dropped[f"{topic.name}:not_sent"] += 1
+
+    def _say(self, what: tuple[Topic[Message], bytes] | None) -> bool:
+        try:
+            self._unsaid.put_nowait(what)
+        except queue.Full:
+            return False
+        return True
+
+    def _speak(self) -> None:
+        """Publish on the robot, in order. A thread of its own, without a lock: `put` waits while the router waits for
+        this process to read, and who reads must not wait for `put`; else both stand still until one closes the session.
+        """
+        while (what := self._unsaid.get()) is not None:
+            topic, payload = what
             try:
                 self._service.link.publish(topic, payload)
             except zenoh.ZError as error:
