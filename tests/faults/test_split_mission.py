@@ -41,6 +41,7 @@ class SplitMission:
         self.cuts: list[Cut] = []
         base = f"tcp/{network.address(BASE)}:7447"
         shared = {
+            "PLGRIM_DEPLOYMENT__PUBLISHED_ON": "none",  # two namespaces and a cable between them
             "PLGRIM_LINK__ENDPOINT": base,
             "PLGRIM_CLOCK_ORIGIN_NS": str(time.monotonic_ns()),
             "PLGRIM_RUNTIME__ROUTER_TIMEOUT_S": "120",
