@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from planning.bits import count_bits, lowest_bit
 from planning.grid import DIRECTION_DX, DIRECTION_DY
 from planning.kernels import njit, njit_borrowing
-from planning.lattice_graph import travel_costs
+from planning.lattice_graph import seen_by_any, travel_costs
 from planning.pomcp import (
     SearchSettings,
     Tree,
@@ -477,23 +477,6 @@ def follow_rule(
 
 
 @njit
-def seen_by_any(
-    visible: NDArray[np.uint32], connected: NDArray[np.bool_], size: int, reach: int, seen: NDArray[np.bool_]
-) -> None:
-    """Mark the nodes that some connected node sees; seen: (n,) out. Others cannot be covered from here."""
-    for node in range(size * size):
-        if not connected[node]:
-            continue
-        for r in range(2 * reach + 1):
-            word = np.uint64(visible[node, r])
-            while word != np.uint64(0):
-                row, column = node // size + r - reach, node % size + lowest_bit(word) - reach
-                word &= word - _ONE
-                if 0 <= row < size and 0 <= column < size:
-                    seen[row * size + column] = True
-
-
-@njit
 def best_viewpoint(
     visible: NDArray[np.uint32],
     cost: NDArray[np.float64],
@@ -659,22 +642,6 @@ def _footprints(
 
 
 @njit
-def _has_looked(
-    footprint: NDArray[np.uint64],
-    top: NDArray[np.int32],
-    node: NDArray[np.int32],
-    covered: NDArray[np.uint64],
-) -> bool:
-    """Whether all that these nodes see all around is covered already."""
-    for i in node:
-        for r in range(footprint.shape[2]):
-            row = top[i] + r
-            if 0 <= row < covered.shape[0] and footprint[i, 0, r] & ~covered[row]:
-                return False
-    return True
-
-
-@njit
 def _fresh_most(
     footprint: NDArray[np.uint64], top: NDArray[np.int32], step_to: NDArray[np.int32]
 ) -> NDArray[np.int64]:
@@ -751,15 +718,14 @@ def build_model(
     )
     footprint = np.zeros((size * size, 8, 2 * reach + 1), np.uint64)
     low, high = np.zeros((size * size, 8), np.int8), np.zeros((size * size, 8), np.int8)
-    _footprints(seen, wedge_rows(reach, fov_rad), np.array(root.covered), reach, footprint, low, high)
-    looked = fov_rad >= _FULL_TURN and bool(
-        _has_looked(footprint, top_row, np.array(root.node), np.array(root.covered))
-    )
+    covered = np.array(root.covered)
+    _footprints(seen, wedge_rows(reach, fov_rad), covered, reach, footprint, low, high)
+    looked = fov_rad >= _FULL_TURN and not high[root.node, 0].any()
     fresh = _fresh_most(footprint, top_row, step_to) if looked else np.zeros((0, 8), np.int64)
     return CoverageModel(
         size, reach, weights, step_to, top_row, distance, risk, weights.gamma_per_m ** distance.astype(np.float64),
         np.array(entropy), low, high, footprint, np.array(leaf_value),
         np.array(root.node), np.array(root.heading),
-        np.array(root.weight), np.array(root.covered), move, cost, rows, top, horizon, rollout_random,
+        np.array(root.weight), covered, move, cost, rows, top, horizon, rollout_random,
         fov_rad < _FULL_TURN, looked, fresh,
     )  # fmt: skip

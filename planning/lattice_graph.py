@@ -1,4 +1,4 @@
-"""Searches on the lattice of the Local IRM: travel between nodes, first moves, and how values spread."""
+"""On the lattice of the Local IRM: travel between nodes, first moves, how values spread, and what any node sees."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.bits import lowest_bit
 from planning.grid import DIRECTION_DX, DIRECTION_DY
 from planning.kernels import njit
 from planning.search import heap_pop, heap_push_or_lower
@@ -96,3 +97,20 @@ def spread_values(
                     value[node] = candidate
                     changed = True
         sweep += 1
+
+
+@njit
+def seen_by_any(
+    visible: NDArray[np.uint32], connected: NDArray[np.bool_], size: int, reach: int, seen: NDArray[np.bool_]
+) -> None:
+    """Mark the nodes that some connected node sees; seen: (n,) out. Others cannot be covered from here."""
+    for node in range(size * size):
+        if not connected[node]:
+            continue
+        for r in range(2 * reach + 1):
+            word = np.uint64(visible[node, r])
+            while word != np.uint64(0):
+                row, column = node // size + r - reach, node % size + lowest_bit(word) - reach
+                word &= word - np.uint64(1)
+                if 0 <= row < size and 0 <= column < size:
+                    seen[row * size + column] = True

@@ -8,31 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.bits import lowest_bit
 from planning.kernels import njit
+from planning.lattice_graph import seen_by_any
 from planning.rays import visible_mass
 
 _NEARLY = 0.5
 """Share of the best view of a patch that is as good."""
-_ONE = np.uint64(1)
-
-
-@njit
-def _orphans(
-    entropy: NDArray[np.float32], rows: NDArray[np.uint32], size: int, reach: int
-) -> NDArray[np.bool_]:
-    """Patches that hold something and are in no node's rows, (n,)."""
-    orphan = entropy > 0.0
-    for node in range(size * size):
-        for r in range(2 * reach + 1):
-            row = node // size + r - reach
-            word = np.uint64(rows[node, r])
-            while word != np.uint64(0):
-                column = node % size + lowest_bit(word) - reach
-                word &= word - _ONE
-                if 0 <= row < size and 0 <= column < size:
-                    orphan[row * size + column] = False
-    return orphan
 
 
 @njit
@@ -55,7 +36,9 @@ def add_glimpses(
 
     Arguments as of `visible_rows`. entropy, rows: (n,), (n, 2 reach + 1), changed. Returns how many such patches.
     """
-    orphan = _orphans(entropy, rows, size, reach)
+    shown = np.zeros(size * size, np.bool_)
+    seen_by_any(rows, np.ones(size * size, np.bool_), size, reach, shown)
+    orphan = (entropy > 0.0) & ~shown
     best, seen = np.zeros(size * size, np.float32), np.zeros(size * size, np.float32)
     view = np.zeros((size * size, 2 * reach + 1, 2 * reach + 1), np.float32)
     for sweep in range(2):

@@ -119,11 +119,11 @@ def upright(sweep: Sweep, step_m: float, height_m: float) -> NDArray[np.bool_]:
 
 
 @njit
-def _lowest_beyond(sweep: Sweep, b: int, steepest: NDArray[np.float32]) -> None:
+def _lowest_beyond(sweep: Sweep, b: int, lowest_rise: NDArray[np.float32]) -> None:
     """Into (bins,): rise per metre of the lowest ray of a bearing that ends beyond each bin; inf: none does."""
     lowest = np.float32(np.inf)
-    for k in range(steepest.size - 1, -1, -1):
-        steepest[k] = lowest
+    for k in range(lowest_rise.size - 1, -1, -1):
+        lowest_rise[k] = lowest
         if sweep.low[b, k] < np.inf:
             lowest = min(lowest, (sweep.low[b, k] - np.float32(sweep.sensor[2])) / sweep.low_distance[b, k])
 
@@ -139,7 +139,7 @@ def walk(
     likes. So crowns, overhangs and decks above the robot are not ground, as long as ground below them leads there, nor
     is anything below which a ray has passed, in this sweep or before: a roof that comes down is no ground that rises.
     """
-    steepest = np.empty(sweep.low.shape[1], dtype=np.float32)
+    lowest_rise = np.empty(sweep.low.shape[1], dtype=np.float32)
     kind = np.zeros(sweep.low.shape, dtype=np.uint8)
     ground = np.zeros(sweep.low.shape, dtype=np.float32)
     for b in range(BEARINGS):
@@ -147,7 +147,7 @@ def walk(
             continue
         angle = 2.0 * math.pi * (b + 0.5) / BEARINGS
         dx, dy = math.cos(angle), math.sin(angle)
-        _lowest_beyond(sweep, b, steepest)
+        _lowest_beyond(sweep, b, lowest_rise)
         last_z, last_r = rules.feet_m, 0.0
         trend = rules.lean_x * dx + rules.lean_y * dy
         for k in range(sweep.low.shape[1]):
@@ -157,7 +157,7 @@ def walk(
             r = sweep.low_distance[b, k]
             row, column = slot(rules, cells.shape[0], cells.shape[1], sweep.sensor[0] + r * dx, sweep.sensor[1] + r * dy)  # fmt: skip  # noqa: E501
             known, mean, gap = False, np.float32(0.0), r - last_r
-            bound = sweep.sensor[2] + steepest[k] * r + BOUND_TOLERANCE_M + 3.0 * rules.angle_sigma_rad * r
+            bound = sweep.sensor[2] + lowest_rise[k] * r + BOUND_TOLERANCE_M + 3.0 * rules.angle_sigma_rad * r
             if row >= 0:
                 # Much lower than what leads there it is the ground of another storey, unless a slope may lie between.
                 mean = cells[row, column, MEAN]
