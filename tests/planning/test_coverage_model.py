@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from planning.coverage_build import best_viewpoint, reachable_entropy
 from planning.coverage_model import (
     BITS,
     HEADING,
@@ -26,13 +27,11 @@ from planning.coverage_model import (
     _rollout,
     _sample,
     _step,
-    best_viewpoint,
     edge_blocked,
     evaluate_moves,
     follow_rule,
     look,
     new_nodes,
-    reachable_entropy,
     rollout_value,
     search_coverage,
     turn_share,
