@@ -204,21 +204,28 @@ def _footprints(
 
 @njit
 def _fresh_most(
-    footprint: NDArray[np.uint64], top: NDArray[np.int32], step_to: NDArray[np.int32]
-) -> NDArray[np.int64]:
-    """(n, 8): how many nodes the end of an edge sees all around that its start does not."""
-    n, rows = footprint.shape[0], footprint.shape[2]
-    fresh = np.zeros((n, 8), np.int64)
+    footprint: NDArray[np.uint64],
+    row_low: NDArray[np.int8],
+    row_high: NDArray[np.int8],
+    top: NDArray[np.int32],
+    step_to: NDArray[np.int32],
+    fresh: NDArray[np.int16],
+) -> None:
+    """(n, h, 8), out: how many nodes are seen from the end of a step that are not from its start, by the heading there.
+
+    h = 1: the sensor looks all around.
+    """
+    n, rows, headings = footprint.shape[0], footprint.shape[2], fresh.shape[1]
     for node in range(n):
         for k in range(8):
             other = step_to[node, k]
             if other < 0:
                 continue
-            for r in range(rows):
+            for r in range(row_low[other, k], row_high[other, k]):
                 own = top[other] + r - top[node]
-                seen = footprint[node, 0, own] if 0 <= own < rows else np.uint64(0)
-                fresh[node, k] += count_bits(footprint[other, 0, r] & ~seen)
-    return fresh
+                for h in range(headings):
+                    seen = footprint[node, h, own] if 0 <= own < rows else np.uint64(0)
+                    fresh[node, h, k] += count_bits(footprint[other, k, r] & ~seen)
 
 
 def lattice_steps(size: int) -> NDArray[np.int32]:
@@ -281,12 +288,16 @@ def build_model(
     low, high = np.zeros((size * size, 8), np.int8), np.zeros((size * size, 8), np.int8)
     covered = np.array(root.covered)
     _footprints(seen, wedge_rows(reach, fov_rad), covered, reach, footprint, low, high)
-    looked = fov_rad >= _FULL_TURN and not high[root.node, 0].any()
-    fresh = _fresh_most(footprint, top_row, step_to) if looked else np.zeros((0, 8), np.int64)
+    unlooked, fresh = (
+        np.zeros(size * size, np.bool_),
+        np.zeros((size * size, 1 if fov_rad >= _FULL_TURN else 8, 8), np.int16),
+    )
+    unlooked[root.node[high[root.node, root.heading] > 0]] = True
+    _fresh_most(footprint, low, high, top_row, step_to, fresh)
     return CoverageModel(
         size, reach, weights, step_to, top_row, distance, risk, weights.gamma_per_m ** distance.astype(np.float64),
         np.array(entropy), low, high, footprint, np.array(leaf_value),
         np.array(root.node), np.array(root.heading),
         np.array(root.weight), covered, move, cost, rows, top, horizon, rollout_random,
-        fov_rad < _FULL_TURN, looked, fresh,
+        fov_rad < _FULL_TURN, fresh, unlooked,
     )  # fmt: skip

@@ -52,8 +52,9 @@ class CoverageModel(NamedTuple):
     looks_on_turn: whether turning shows something new: not to a sensor that looks all around. It has looked from where
     the robot stands; what the model still promises there would be seen from the node's anchor.
     horizon: moves of every simulation, in the tree and the rollout together, so that values of short and of long
-    actions compare. looked_around: the sensor looks all around and nothing that it sees from the root is uncovered.
-    fresh_most: (n, 8), then the most that a move can newly cover.
+    actions compare. fresh_most: (n, h, 8), the most that a move can newly cover, by the heading under which the sensor
+    has looked from the node, h = 8, or 1 for one that looks all around. unlooked: (n,), the nodes of the root belief
+    from which something uncovered is in sight: there, and only there, this bound does not hold.
     """
 
     size: int
@@ -80,8 +81,8 @@ class CoverageModel(NamedTuple):
     horizon: int
     rollout_random: float
     looks_on_turn: bool
-    looked_around: bool
-    fresh_most: NDArray[np.int64]
+    fresh_most: NDArray[np.int16]
+    unlooked: NDArray[np.bool_]
 
 
 @njit_borrowing
@@ -204,6 +205,8 @@ def best_gain_direction(
         model.top,
     )
     k_risk = model.weights.k_risk
+    bounded, fresh_most = not model.unlooked[node], model.fresh_most
+    under = heading if fresh_most.shape[1] > 1 else 0
     best, best_score = -1, 0.0
     for i in range(8):
         # Straight ahead first: it often wins, and then what others could gain at most settles them.
@@ -212,7 +215,7 @@ def best_gain_direction(
         if distance <= 0.0 or (tried >> k) & 1 or edge_risk[node, k] > MAX_EDGE_RISK:
             continue
         cost, risk_cost = distance + 0.7 * _TURN[heading, k], k_risk * edge_risk[node, k]
-        if model.looked_around and 0.5000001 * model.fresh_most[node, k] < (best_score + risk_cost) * cost:
+        if bounded and 0.5000001 * fresh_most[node, under, k] < (best_score + risk_cost) * cost:
             continue
         other = step_to[node, k]
         gain = new_nodes(footprint, row_low, row_high, tops[other], other, k, covered)
