@@ -230,10 +230,10 @@ def test_the_model_is_the_shared_one() -> None:
 def test_the_model_counts_ground_left_behind_as_lcp_does() -> None:
     lattice = random_lattice(3, SIZE, 2, wall_share=0.2, covered_share=0.5)
     irm = local_irm(lattice)
-    found = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), CONFIG).entropy
+    weights = RewardWeights(leftover_weight=3.0, leftover_gain=0.3)
+    found = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), Config(weights=weights)).entropy
     reached = reachable_entropy(irm.entropy, irm.visible, irm.edge_distance_m, irm.size, irm.reach)
-    np.testing.assert_allclose(found, leftover_entropy(reached, irm.state == 1, irm.size, CONFIG.weights))
-    weights = RewardWeights(leftover_weight=0.0, leftover_gain=0.0)
-    paper = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), Config(weights=weights)).entropy
+    np.testing.assert_allclose(found, leftover_entropy(reached, irm.state == 1, irm.size, weights))
+    paper = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), CONFIG).entropy
     np.testing.assert_allclose(paper, reached)
     assert (found > paper).any()
