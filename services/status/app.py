@@ -1,7 +1,4 @@
-"""The status over HTTP: a thin adapter of `StatusCore`.
-
-The page at `/` and all answers need nothing from elsewhere; only `/docs` loads its script from a CDN.
-"""
+"""The status over HTTP: a thin adapter of `StatusCore`. Its pages and answers need nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -79,6 +76,8 @@ def create_app(shared: SharedStatus) -> FastAPI:
         version="1",
         description=_DESCRIPTION,
         openapi_tags=_TAGS,
+        docs_url=None,  # FastAPI's own pages load their scripts from a CDN: see page.py
+        redoc_url=None,
         default_response_class=FiniteJSONResponse,
     )
     secure(app, shared.config)
