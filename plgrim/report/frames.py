@@ -33,7 +33,7 @@ _PATH, _EDGE, _CRUMB, _EDGE_OF, _TARGET, _PLAN, _INK = (
     (194, 65, 12), (146, 175, 196), (59, 92, 160), (217, 119, 6), (190, 18, 60), (29, 78, 216), (31, 41, 51),
 )  # fmt: skip
 _LEGEND = ("robot", "driven", "plan", "target", "frontier", "road map", "covered", "to cover", "obstacle")
-_LEGEND_PX, _LEGEND_FONT = 22, 13
+LEGEND_PX, _LEGEND_FONT = 22, 13
 """Height of the line below the map that says what is what, and its letters'."""
 SHOWN = frozenset(
     {
@@ -169,7 +169,7 @@ class FrameMaker:
         self._draw_plan(pen, canvas)
         self._draw_robot(pen, canvas)
         width, height = canvas.size
-        picture = Image.new("RGB", (width, height + _LEGEND_PX), _WORLD_GHOST)
+        picture = Image.new("RGB", (width, height + LEGEND_PX), _WORLD_GHOST)
         picture.paste(image.resize(canvas.size, Image.Resampling.LANCZOS))
         picture.paste(_legend(width), (0, height))
         self._write(ImageDraw.Draw(picture), now)
@@ -260,8 +260,8 @@ def _arrow(pen: ImageDraw.ImageDraw, x: float, y: float, yaw: float) -> None:
 @cache
 def _legend(width: int) -> Image.Image:
     """What is what, in a line; from the left as far as it fits."""
-    large = Image.new("RGB", (width * _SCALE, _LEGEND_PX * _SCALE), _WORLD_GHOST)
-    pen, x, y = ImageDraw.Draw(large), 12.0 * _SCALE, _LEGEND_PX * _SCALE / 2
+    large = Image.new("RGB", (width * _SCALE, LEGEND_PX * _SCALE), _WORLD_GHOST)
+    pen, x, y = ImageDraw.Draw(large), 12.0 * _SCALE, LEGEND_PX * _SCALE / 2
     size = _LEGEND_FONT * _SCALE
     for word in _LEGEND:
         wide = pen.textlength(word, font_size=size)
@@ -270,7 +270,7 @@ def _legend(width: int) -> Image.Image:
         _sign(pen, word, x, y)
         pen.text((x + 12 * _SCALE, y), word, fill=_INK, font_size=size, anchor="lm")
         x += wide + 33 * _SCALE
-    return large.resize((width, _LEGEND_PX), Image.Resampling.LANCZOS)
+    return large.resize((width, LEGEND_PX), Image.Resampling.LANCZOS)
 
 
 def _sign(pen: ImageDraw.ImageDraw, word: str, x: float, y: float) -> None:

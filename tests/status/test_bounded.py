@@ -58,6 +58,7 @@ def _feed(shared: SharedStatus, n: int, cell: np.ndarray) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_what_is_remembered_of_a_long_mission_is_bounded() -> None:
     """Margin: 1 MB between the 2,000th and the 4,000th update, of a core that holds a few."""
     config = Config(max_trajectory_points=500)
