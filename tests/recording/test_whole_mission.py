@@ -3,6 +3,7 @@ the mission's end. Every service a process of its own over Zenoh, its planners s
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,10 +13,8 @@ from pathlib import Path
 import pytest
 
 from plgrim.recording.reader import read_raw
-from plgrim.recording.replay import Replay
 from plgrim.registry import STAGES
 from schemas.codec import decode
-from schemas.contract import SECOND_NS
 from schemas.operation import FinishReason, MissionState
 from tests.faults.kill import free_port
 from tests.faults.small_map import START, write_small_map
@@ -26,10 +25,12 @@ SPEED = 0.5
 
 
 def _plgrim(folder: Path, environment: dict[str, str], name: str, *arguments: str) -> subprocess.Popen[bytes]:
-    with (folder / f"{name}.log").open("wb") as log:
+    """A command at a terminal of its own, as far as the scheduler is concerned."""
+    with (folder / f"{name}.out").open("wb") as out, (folder / f"{name}.log").open("wb") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "plgrim", *arguments], cwd=folder, env=environment, stdout=log, stderr=log
-        )
+            [sys.executable, "-m", "plgrim", name, *arguments],
+            cwd=folder, env=environment, stdout=out, stderr=log, start_new_session=True,
+        )  # fmt: skip
 
 
 def _states(recording: Path) -> list[MissionState]:
@@ -46,10 +47,8 @@ def test_a_whole_live_mission_says_the_same_again(tmp_path: Path) -> None:
         "PLGRIM_STATUS__PORT": str(free_port()),
     }
     where = ["--map", str(write_small_map(tmp_path)), "--start", str(START["x_m"]), str(START["y_m"])]
-    mission = _plgrim(
-        tmp_path, environment, "explore", "explore", *where, "--speed", str(SPEED), "--out", "m"
-    )
-    recorder = _plgrim(tmp_path, environment, "record", "record", "--raw-only", "--out", "r")
+    mission = _plgrim(tmp_path, environment, "explore", *where, "--speed", str(SPEED), "--out", "m")
+    recorder = _plgrim(tmp_path, environment, "record", "--raw-only", "--out", "r")
     try:
         assert mission.wait(1000) == 0, (tmp_path / "explore.log").read_text(errors="replace")[-3000:]
         recorder.send_signal(signal.SIGINT)
@@ -59,13 +58,15 @@ def test_a_whole_live_mission_says_the_same_again(tmp_path: Path) -> None:
             if process.poll() is None:
                 process.terminate()
                 process.wait(60)
-    said = (tmp_path / "record.log").read_text(errors="replace")
-    assert "lost:" not in said, said[-2000:]
+    said = (tmp_path / "record.out").read_text(errors="replace")
+    assert "lost:" not in said, f"this machine is too busy for the test: {said[-2000:]}"
     states = _states(tmp_path / "r")
     assert states[-1].finish == FinishReason.COVERED
-    report = Replay(STAGES).run(tmp_path / "r")
-    print(f"\n{report.summary()}")
-    assert report.same, report.summary()
-    assert set(report.steps) == set(STAGES)
-    assert min(report.outputs.values()) > 10
-    assert (report.ended_ns - report.began_ns) / SECOND_NS > 0.8 * states[-1].elapsed_s
+    again = _plgrim(tmp_path, environment, "replay", "r", "--json")
+    code = again.wait(900)
+    report = json.loads((tmp_path / "replay.out").read_text())
+    print(f"\n{report}")
+    assert code == 0
+    assert report["same"]
+    assert set(report["steps"]) == set(STAGES)
+    assert min(report["outputs"].values()) > 10
