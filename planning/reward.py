@@ -64,8 +64,8 @@ def leftover_entropy(
     """Entropy of the nodes of a lattice as the local planners count it: leaving ground behind costs a way back.
 
     entropy: (n,), 0 where covered. known: (n,), traversable nodes. An uncovered patch counts at least leftover_gain,
-    and (1 + leftover_weight f) times, f the share of its known neighbours that are covered. With both at 0, the default,
-    it is the paper's reward.
+    and (1 + leftover_weight f) times, f the share of its known neighbours that are covered. With both at 0, the
+    default, it is the paper's reward.
     """
     wanted, traversable = (entropy > 0.0).reshape(size, size), known.reshape(size, size)
     done, neighbours = np.zeros((size, size)), np.zeros((size, size))
