@@ -32,7 +32,7 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
 
 @pytest.fixture(scope="session")
 def certificates_by_role(authority: Authority, tmp_path_factory: pytest.TempPathFactory) -> dict[Role, Path]:
-    """A folder for each kind of host; the routers are known as 127.0.0.1; what comes from the robot has one for both."""
+    """A folder for each kind of host; the routers are known as 127.0.0.1; the robot's link has one for both."""
     folders = {role: tmp_path_factory.mktemp(f"certs-{role}") for role in ROLES}
     for role, folder in folders.items():
         for process in processes_of(role):
