@@ -61,7 +61,8 @@ def session_config(router: RouterConfig, mode: str, process: str = TOOLS) -> dic
         "timestamping": {"enabled": False},
         "queries_default_timeout": 1000,
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "adminspace": {"enabled": False},
+        # Without permissions too: a stock zenohd switches it on, whatever its file says.
+        "adminspace": {"enabled": False, "permissions": {"read": False, "write": False}},
         "transport": {
             "shared_memory": {"enabled": router.shared_memory},
             "unicast": {"open_timeout": 1500, "accept_timeout": 1500},
