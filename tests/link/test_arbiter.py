@@ -171,7 +171,7 @@ def test_a_base_that_lives_but_does_not_answer_loses_the_lease() -> None:
 
 
 def test_what_has_aged_by_the_hand_back_is_not_passed_on_with_it() -> None:
-    """Its only policy was in order when it came; by the time the base is obeyed, the robot has known better for long."""
+    """Its only policy was in order when it came; when the base is obeyed, the robot has known better for long."""
     world = _World()
     for _ in range(5):
         world.second(base=False)
