@@ -15,7 +15,7 @@ from plgrim.recording.transfer import Fetcher, Offer
 from plgrim.recording.well_known import Translator
 from plgrim.recording.writer import Ring, about
 from plgrim.runtime.health import HealthMonitor, query_key
-from plgrim.runtime.zenoh_session import connect
+from plgrim.runtime.zenoh_session import connect, many_receivers
 from plgrim.security.access import RECORDER
 from plgrim.security.exposure import check_client
 from schemas.codec import Envelope, encode
@@ -39,6 +39,7 @@ def run_recorder(
     check_client(config, RECORDER)
     if base_endpoint:
         check_client(_at(config, base_endpoint), RECORDER)
+    many_receivers()
     ring = Ring(folder, about(config.robot, config.seed, world_name(config)), segment_s, max_bytes)
     # A recorder that a busy machine keeps waiting is not gone.
     patient = config.router.model_copy(update={"lease_ms": max(config.router.lease_ms, _LEASE_MS)})
