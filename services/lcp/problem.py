@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.coverage_model import CoverageModel, RootBelief, build_model, reachable_entropy
+from planning.coverage_build import RootBelief, build_model, reachable_entropy
+from planning.coverage_model import CoverageModel
 from planning.frames import planar
 from planning.lattice_graph import spread_values
 from planning.reward import RewardWeights, parameters

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.coverage_model import MAX_EDGE_RISK, CoverageModel, RootBelief, build_model, evaluate_moves
+from planning.coverage_build import RootBelief, build_model
+from planning.coverage_model import MAX_EDGE_RISK, CoverageModel, evaluate_moves
 from planning.kernels import njit
 from planning.lattice_graph import neighbour, travel_costs
 from planning.reward import RewardWeights, parameters, travel_discount

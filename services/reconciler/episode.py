@@ -9,14 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.coverage_model import (
-    CoverageModel,
-    RootBelief,
-    build_model,
-    evaluate_moves,
-    look,
-    reachable_entropy,
-)
+from planning.coverage_build import RootBelief, build_model, reachable_entropy
+from planning.coverage_model import CoverageModel, evaluate_moves, look
 from planning.randomness import stream
 from planning.reward import leftover_entropy, parameters
 from planning.search import dijkstra_box, trace_path

@@ -14,7 +14,17 @@ from schemas.policy import LocalPolicy
 from schemas.sensing import FollowerState, Odometry
 from services.reconciler.config import Config
 from services.reconciler.episode import Committed, Opened
-from services.reconciler.path import STEP_M, Ground, clearance_at, first_hazard, project, resample, smooth
+from services.reconciler.path import (
+    ARC_POINTS,
+    STEP_M,
+    Ground,
+    clearance_at,
+    first_hazard,
+    project,
+    resample,
+    round_corners,
+    smooth,
+)
 from services.reconciler.trail import Trail
 
 _KEPT = ("at", "end", "changed", "why", "trouble_ns", "backing_ns", "idle_ns")
@@ -25,6 +35,8 @@ _BACKING_S = 5.0
 _ON_SPOT_RAD = math.radians(40.0)
 """From about so much on followers turn on the spot."""
 _MORE_ROOM_M = 0.05
+_NEAR_POINTS = 2
+"""So far before the robot the line stays as it is."""
 _REACTION_S = 0.2
 """So long it goes on as it goes before it brakes."""
 _ROOM_WITHIN_M = 1.5
@@ -69,13 +81,19 @@ class Driven:
             return here
         return np.concatenate([here, self.committed.points[self.at + 1 : self.end + 1]])
 
-    def commit(self, opened: Opened, policy: LocalPolicy, odometry: Odometry, ground: Ground) -> None:
-        """Concatenate the kept prefix and the new policy (Eq. 19), smoothed."""
-        self.committed = concatenate(opened, policy, ground, self._config)
+    def commit(self, opened: Opened, policy: LocalPolicy, odometry: Odometry, ground: Ground) -> int:
+        """Concatenate the kept prefix and the new policy (Eq. 19), smoothed. Returns how many points of the old policy
+        were kept."""
+        here = (odometry.pose.x_m, odometry.pose.y_m)
+        self.committed = concatenate(opened, policy, ground, self._config, here)
         points = self.committed.points
         self.at, _ = project(points, odometry.pose.x_m, odometry.pose.y_m, 0, min(40, len(points) - 1))
         self.end = len(points) - 1
         self.changed, self.why = True, policy.reason
+        if not opened.keeps_old:
+            return 0
+        same = (points[: len(opened.prefix)] == opened.prefix[: len(points)]).all(axis=1)
+        return len(same) if same.all() else int(np.argmin(same))
 
     def check_hazards(self, ground: Ground) -> None:
         """Truncate the path before the first place where the robot does not fit or the ground is unknown."""
@@ -244,13 +262,22 @@ class Driven:
         self._trail.load(state["trail"])
 
 
-def concatenate(opened: Opened, policy: LocalPolicy, ground: Ground, config: Config) -> Committed:
-    """The prefix that an episode kept and the policy that answered it, as one smooth line with its nodes."""
+def concatenate(
+    opened: Opened, policy: LocalPolicy, ground: Ground, config: Config, robot: tuple[float, float]
+) -> Committed:
+    """The prefix that an episode kept and the policy that answered it, as one smooth line with its nodes.
+
+    robot: where it is, m. Of a prefix that was kept, at most the last half metre changes: the corner at the junction.
+    """
     prefix = opened.prefix
     raw = np.concatenate([prefix, policy.path_xy_m[1:]]) if len(prefix) else policy.path_xy_m
     fixed = len(prefix) if opened.keeps_old else max(1, len(prefix) // 2)
     offset = len(raw) - len(policy.path_xy_m)
     points = smooth(raw, fixed, ground, config, offset + looked_along(policy))
+    g = ground.spec
+    near, _ = project(points, *robot, 0, min(40, len(points) - 1))
+    begin = max(near + _NEAR_POINTS, len(prefix) - 2 - ARC_POINTS if opened.keeps_old else 0)
+    round_corners(points, begin, ground.clearance_m, g.resolution_m, g.ix0, g.iy0, config.comfort_clearance_m)
     lattice = np.concatenate([opened.kept_lattice, policy.path_lattice[1:].astype(np.int64)])
     anchors = policy.path_xy_m[policy.path_node_point[1:]]
     node_point = list(opened.kept_point)

@@ -20,6 +20,9 @@ STEP_M = 0.1
 """Spacing of the points of a path."""
 _FREE = FREE
 _WAY_OUT_M = 1.0
+_SHARP_LEAST, _SHARP_MOST = math.radians(35.0), math.radians(130.0)
+ARC_POINTS = 5
+"""On either side of a corner: half a metre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,6 +236,76 @@ def relax(
             after = clearance_at(clearance_m, h, ix0, iy0, nx, ny)
             if after >= floor_m[i] and after >= min(before, radius_m):
                 line[i, 0], line[i, 1] = nx, ny
+
+
+@njit
+def round_corners(
+    line: NDArray[np.float64],
+    begin: int,
+    clearance_m: NDArray[np.float32],
+    resolution_m: float,
+    ix0: int,
+    iy0: int,
+    comfort_m: float,
+) -> None:
+    """Turn corners from index `begin` on into arcs, in place: at a sharp one the follower stops and turns on the spot.
+
+    A corner is a turn of 35 to 130 degrees at one point, with `ARC_POINTS` points or fewer to the next corner on both
+    sides for the arc. It stays where an arc would come nearer to obstacles than is comfortable and than it did.
+    """
+    i = begin + 2
+    while i < line.shape[0] - 2:
+        if not _SHARP_LEAST < _turn_at(line, i) < _SHARP_MOST:
+            i += 1
+            continue
+        span = 2
+        while (
+            span < ARC_POINTS
+            and i - span - 1 >= begin
+            and i + span + 1 < line.shape[0]
+            and abs(_turn_at(line, i - span)) < 0.3
+            and abs(_turn_at(line, i + span)) < 0.3
+        ):
+            span += 1
+        _put_arc(line, i, span, clearance_m, resolution_m, ix0, iy0, comfort_m)
+        i += span
+    return
+
+
+@njit
+def _turn_at(line: NDArray[np.float64], i: int) -> float:
+    """Angle between the steps to and from a point, 0 to pi."""
+    ax, ay = line[i, 0] - line[i - 1, 0], line[i, 1] - line[i - 1, 1]
+    bx, by = line[i + 1, 0] - line[i, 0], line[i + 1, 1] - line[i, 1]
+    return abs(math.atan2(ax * by - ay * bx, ax * bx + ay * by))
+
+
+@njit
+def _put_arc(
+    line: NDArray[np.float64],
+    i: int,
+    span: int,
+    clearance_m: NDArray[np.float32],
+    resolution_m: float,
+    ix0: int,
+    iy0: int,
+    comfort_m: float,
+) -> None:
+    """Replace the points within `span` of a corner by as many on a curve, unless that comes too near to something."""
+    ax, ay, bx, by = line[i - span, 0], line[i - span, 1], line[i + span, 0], line[i + span, 1]
+    cx, cy = line[i, 0], line[i, 1]
+    # The circle that touches both legs, as a rational quadratic curve with the weight cos(turn / 2).
+    weight = math.cos(0.5 * _turn_at(line, i))
+    arc = np.empty((2 * span - 1, 2))
+    for j in range(1, 2 * span):
+        t = j / (2.0 * span)
+        u, v, w = (1.0 - t) * (1.0 - t), 2.0 * t * (1.0 - t) * weight, t * t
+        x, y = (u * ax + v * cx + w * bx) / (u + v + w), (u * ay + v * cy + w * by) / (u + v + w)
+        needed = min(clearance_at(clearance_m, resolution_m, ix0, iy0, cx, cy), comfort_m) - 0.004
+        if clearance_at(clearance_m, resolution_m, ix0, iy0, x, y) < needed:
+            return
+        arc[j - 1, 0], arc[j - 1, 1] = x, y
+    line[i - span + 1 : i + span] = arc
 
 
 @njit

@@ -339,9 +339,8 @@ class ReconcilerStage:
         if policy.phase == LocalPhase.COVER and policy.rollout_value > 0.1:
             ratio = min(max(policy.root_value / policy.rollout_value, 1.0), 2.0)
             self._value_ratio += 0.2 * (ratio - self._value_ratio)
-        self._driven.commit(opened, policy, odometry, ground)
+        self._kept_end = self._driven.commit(opened, policy, odometry, ground)
         self._tau_s = opened.tau_s
-        self._kept_end = len(opened.prefix) if opened.keeps_old else 0
 
     # --- motion -------------------------------------------------------------------------------------------------
 

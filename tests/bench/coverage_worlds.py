@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from planning.coverage_model import CoverageModel, RootBelief, build_model
+from planning.coverage_build import RootBelief, build_model
+from planning.coverage_model import CoverageModel
 from planning.grid import DIRECTION_DX, DIRECTION_DY
 from planning.reward import parameters
 from services.lcp.config import Config

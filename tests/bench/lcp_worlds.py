@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from planning.coverage_build import reachable_entropy
 from planning.coverage_model import (
     MAX_EDGE_RISK,
     SWEEP,
@@ -21,7 +22,6 @@ from planning.coverage_model import (
     follow_rule,
     look,
     new_nodes,
-    reachable_entropy,
     search_coverage,
 )
 from planning.lattice_graph import travel_costs

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planning.coverage_model import reachable_entropy
+from planning.coverage_build import reachable_entropy
 from planning.lattice_graph import travel_costs
 from schemas.operation import MissionPhase
 from schemas.policy import Alternative, GlobalPolicy, LocalPhase

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.coverage_model import ACTIONS, BITS, CoverageModel, RootBelief, build_model
+from planning.coverage_build import RootBelief, build_model
+from planning.coverage_model import ACTIONS, BITS, CoverageModel
 from planning.pomcp import Pomcp
 from planning.reward import RewardWeights, parameters
 

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from planning.coverage_build import best_viewpoint, reachable_entropy
 from planning.coverage_model import (
     BITS,
     HEADING,
@@ -26,13 +27,11 @@ from planning.coverage_model import (
     _rollout,
     _sample,
     _step,
-    best_viewpoint,
     edge_blocked,
     evaluate_moves,
     follow_rule,
     look,
     new_nodes,
-    reachable_entropy,
     rollout_value,
     search_coverage,
     turn_share,
@@ -458,21 +457,23 @@ def test_rollouts_with_chance_stay_on_edges() -> None:
     assert len(ends) > 5
 
 
+@pytest.mark.parametrize("fov_deg", [360.0, 120.0])
 @pytest.mark.parametrize("seed", range(20))
-def test_what_a_sensor_that_looks_all_around_skips_changes_nothing(seed: int) -> None:
-    """Having looked all around, moves are bounded by what they can newly show: the rule and so the search
-    are the same as without that short cut."""
-    lattice = random_lattice(seed, 7, 2, 360.0, wall_share=0.15, risky_share=0.3, covered_share=0.2)
-    start = sorted({node for node, _ in lattice.edges})[seed % 5]
-    model = lattice.model(start, seed % 8, lattice.footprint(start, 0), rollout_random=0.1)
-    assert model.looked_around
-    plain = model._replace(looked_around=False)
-    trees = []
-    for each in (model, plain):
-        solver = coverage_solver(7, max_depth=12)
-        solver.search(search_coverage, each, seed=seed, simulations=400)
-        trees.append(solver.root())
-    assert trees[0].visits.tolist() == trees[1].visits.tolist()
-    assert trees[0].values.tolist() == trees[1].values.tolist()
-    unseen = lattice.model(start, 0, (), rollout_random=0.1)
-    assert not unseen.looked_around or not lattice.footprint(start, 0)
+def test_moves_that_are_skipped_by_what_they_can_newly_show_at_most_change_nothing(
+    seed: int, fov_deg: float
+) -> None:
+    """Having looked from where it came to, the rule and so the search are the same as without that short cut; where the
+    root has not been looked from, too."""
+    lattice = random_lattice(seed, 7, 2, fov_deg, wall_share=0.15, risky_share=0.3, covered_share=0.2)
+    start, heading = sorted({node for node, _ in lattice.edges})[seed % 5], seed % 8
+    for looked in (lattice.footprint(start, heading), ()):
+        model = lattice.model(start, heading, looked, rollout_random=0.1)
+        assert model.unlooked[start] == bool(set(lattice.footprint(start, heading)) - set(looked))
+        plain = model._replace(unlooked=np.ones_like(model.unlooked))
+        trees = []
+        for each in (model, plain):
+            solver = coverage_solver(7, max_depth=12)
+            solver.search(search_coverage, each, seed=seed, simulations=400)
+            trees.append(solver.root())
+        assert trees[0].visits.tolist() == trees[1].visits.tolist()
+        assert trees[0].values.tolist() == trees[1].values.tolist()

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planning.coverage_model import reachable_entropy
+from planning.coverage_build import reachable_entropy
 from planning.reward import RewardWeights, leftover_entropy
 from schemas.base import Pose
 from schemas.sensing import Odometry

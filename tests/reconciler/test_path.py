@@ -21,6 +21,7 @@ from services.reconciler.path import (
     headings,
     project,
     resample,
+    round_corners,
     smooth,
     speeds,
 )
@@ -134,6 +135,53 @@ def test_smoothing_pushes_a_line_off_a_wall() -> None:
     smoothed = smooth(line, 0, ground, CONFIG)
     middle = smoothed[len(smoothed) // 2]
     assert clearance_at(ground, *middle) > clearance_at(ground, 2.0, 0.3) + 0.05
+
+
+def rounded(ground: Ground, line: Line, begin: int = 0) -> Line:
+    """A copy of the line with its corners rounded."""
+    found, s = line.copy(), ground.spec
+    round_corners(found, begin, ground.clearance_m, s.resolution_m, s.ix0, s.iy0, CONFIG.comfort_clearance_m)
+    return found
+
+
+def sharpest(line: Line) -> float:
+    """The greatest turn at a point, rad."""
+    return float(np.abs(np.diff(np.unwrap(headings(line)))).max())
+
+
+@pytest.mark.parametrize("degrees", [40, 60, 90, 120, 150, 180])
+def test_corners_up_to_130_degrees_become_arcs_that_are_driven_without_a_stop(degrees: int) -> None:
+    ground, turn = ground_of(np.zeros((100, 100), np.bool_)), math.radians(degrees)
+    way = np.array([(2.0 + math.cos(turn) * s, 3.0 + math.sin(turn) * s) for s in np.arange(0.1, 2.05, 0.1)])
+    line = np.concatenate([np.array([(x, 3.0) for x in np.arange(0.5, 2.05, 0.1)]), way])
+    arc = rounded(ground, line)
+    assert len(arc) == len(line)
+    if degrees > 130:
+        assert arc.tobytes() == line.tobytes(), "the robot turns on the spot"
+        return
+    assert sharpest(arc) < math.radians(25.0)
+    assert np.hypot(*(arc - line).T).max() < 0.3
+    np.testing.assert_array_equal(arc[[0, 1, -2, -1]], line[[0, 1, -2, -1]])
+    assert rounded(ground, arc).tobytes() == arc.tobytes(), "an arc is no corner"
+    assert speeds(arc, 1.0, ground, CONFIG, 1.0)[0][2:-6].min() >= CONFIG.min_speed_mps - 1e-9
+
+
+@settings(max_examples=40)
+@given(SEEDS, st.integers(0, 30))
+def test_arcs_come_no_nearer_to_obstacles_and_begin_where_they_may(seed: int, begin: int) -> None:
+    ground = random_ground(seed)
+    line = grid_path(ground, seed)
+    assume(line is not None)
+    assert line is not None
+    line = resample(line)
+    arcs = rounded(ground, line, begin)
+    assert arcs[: begin + 1].tobytes() == line[: begin + 1].tobytes()
+    moved = np.flatnonzero((arcs != line).any(axis=1))
+    for i in moved.tolist():
+        near = line[max(i - 5, 0) : i + 6]
+        before = min(clearance_at(ground, float(x), float(y)) for x, y in near)
+        after = clearance_at(ground, *arcs[i].tolist())
+        assert after >= min(before, CONFIG.comfort_clearance_m) - 0.005
 
 
 def test_points_are_a_step_apart() -> None:
