@@ -10,8 +10,8 @@ import pytest
 
 from tests.runtime.helpers import REPOSITORY
 
-_WARM = ("riskmap", "irm", "gcp", "reconciler", "mission")
-"""Of lcp and sim a few come with their first steps, all in the rehearsal of `plgrim.warmup`."""
+_WARM = ("irm", "gcp", "reconciler")
+"""Of the others a few come with their first steps, all in the rehearsal of `plgrim.warmup`."""
 _MISSION_S = 14
 """Long enough for a graph that outgrows its first pool."""
 _LOOK = """
