@@ -195,6 +195,7 @@ def test_the_commands(tmp_path: Path) -> None:
     assert {p.name for p in (tmp_path / "certs").iterdir()} == {
         "router",
         "gcp",
+        "recorder",
         "status",
         "supervisor",
         "tools",
