@@ -35,7 +35,10 @@ _FULL_TURN = 2.0 * math.pi - 1e-6
 
 @lru_cache(maxsize=8)
 def wedge_rows(reach: int, fov_rad: float) -> NDArray[np.uint32]:
-    """(8, 2 reach + 1) words: offsets inside the field of view for each heading; the own node always. Not to be changed."""
+    """(8, 2 reach + 1) words: offsets inside the field of view for each heading; the own node always.
+
+    One array for all who ask: not to be changed.
+    """
     rows = np.zeros((8, 2 * reach + 1), np.uint32)
     for k in range(8):
         heading = k * math.pi / 4.0
@@ -65,42 +68,68 @@ def _rank_moves(
     lists: the footprints, set node h + heading. The score is that of `coverage_model.best_gain_direction`, for all that
     the sensor sees from the end of the move and not from its start.
     """
-    seen, score = np.zeros(256, np.uint64), np.zeros(8)
+    seen, score, fresh = np.zeros(256, np.uint64), np.zeros(8), np.zeros(8, np.int64)
     for node in range(step_to.shape[0]):
         for heading in range(8):
-            own = node * headings + (heading if headings > 1 else 0)
-            first = np.int64(lists.start[own])
-            last = first if unlooked[node] else np.int64(lists.start[own + 1])
-            for e in range(first, last):
-                seen[lists.tile[e]] = lists.word[e]
+            if heading < headings:
+                _count_steps(
+                    lists, node, heading, headings, unlooked[node], edge_distance_m, step_to, seen, fresh
+                )
             for k in range(8):
-                score[k] = 0.0
                 distance, risk = edge_distance_m[node, k], edge_risk[node, k]
+                score[k] = 0.0
                 if distance > 0.0 and risk <= MAX_EDGE_RISK:
-                    other = step_to[node, k] * headings + (k if headings > 1 else 0)
-                    fresh = count_fresh(lists, other, seen)
-                    score[k] = 0.5 * fresh / move_cost(distance, heading, k) - k_risk * risk
-            for e in range(first, last):
-                seen[lists.tile[e]] = np.uint64(0)
-            _sort_moves(score, order[node], most[node, heading], heading)
+                    score[k] = 0.5 * fresh[k] / move_cost(distance, heading, k) - k_risk * risk
+            order[node, heading] = _sort_moves(score, most[node, heading])
 
 
 @njit
-def _sort_moves(
-    score: NDArray[np.float64], order: NDArray[np.int32], most: NDArray[np.float32], heading: int
+def _count_steps(
+    lists: TileLists,
+    node: int,
+    heading: int,
+    headings: int,
+    unlooked: bool,
+    edge_distance_m: NDArray[np.float32],
+    step_to: NDArray[np.int32],
+    seen: NDArray[np.uint64],
+    fresh: NDArray[np.int64],
 ) -> None:
-    """Directions by falling score, 3 bits each, and the scores a little raised (a float32 rounds), 0 for none."""
-    packed, taken = 0, 0
-    for i in range(8):
-        best = -1
-        for j in range(8):
-            k = (heading + j) % 8
-            if not (taken >> k) & 1 and (best < 0 or score[k] > score[best]):
-                best = k
-        taken |= 1 << best
-        packed |= best << (3 * i)
-        most[i] = np.float32(score[best] * 1.000001) if score[best] > 0.0 else np.float32(0.0)
-    order[heading] = packed
+    """How many nodes the end of each step shows that its start under this heading does not, (8,) out.
+
+    seen: scratch, 0 in every tile before and after.
+    """
+    own = node * headings + heading
+    first, last = lists.start[own], lists.start[own + 1]
+    for e in range(first, last):
+        seen[lists.tile[e]] = np.uint64(0) if unlooked else lists.word[e]
+    for k in range(8):
+        if edge_distance_m[node, k] > 0.0:
+            fresh[k] = count_fresh(lists, step_to[node, k] * headings + (k if headings > 1 else 0), seen)
+    for e in range(first, last):
+        seen[lists.tile[e]] = np.uint64(0)
+
+
+@njit
+def _sort_moves(score: NDArray[np.float64], most: NDArray[np.float32]) -> int:
+    """The directions by falling score, 3 bits each; most: (8,) out, the scores in that order, 0 for none.
+
+    They are raised a little, as a float32 rounds: they bound what is computed in float64.
+    """
+    packed, count = np.int64(0), 0
+    for k in range(8):
+        if score[k] <= 0.0:
+            continue
+        raised, at = np.float32(score[k] * 1.000001), 0
+        while at < count and most[at] >= raised:
+            at += 1
+        for i in range(count, at, -1):
+            most[i] = most[i - 1]
+        most[at] = raised
+        below = packed & ((np.int64(1) << (3 * at)) - 1)
+        packed = ((packed - below) << 3) | (np.int64(k) << (3 * at)) | below
+        count += 1
+    return packed  # type: ignore[return-value]  # the compiler's int
 
 
 def lattice_steps(size: int) -> NDArray[np.int32]:
@@ -167,7 +196,9 @@ def build_model(
     _rank_moves(whole, headings, unlooked, distance, risk, step_to, weights.k_risk, order, most)
     return CoverageModel(
         size, headings, weights, step_to, distance, risk, weights.gamma_per_m ** distance.astype(np.float64),
-        tile_entropy, _sights(whole, step_to, headings, unlooked, reach, size, tile_entropy), np.array(leaf_value),
+        tile_entropy,
+        _sights(whole, np.where(distance > 0.0, step_to, -1), headings, unlooked, reach, size, tile_entropy),
+        np.array(leaf_value),
         np.array(root.node), np.array(root.heading),
         np.array(root.weight), tiles_of_rows(np.array(root.covered), size),
         groups.move, groups.cost, groups.tile, groups.word, horizon, rollout_random,

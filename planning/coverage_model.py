@@ -1,8 +1,8 @@
 """The local coverage problem as a generative model: motion and observation model and reward (paper, LCP and Eq. 5).
 
 Shared by lcp, reconciler and baselines. State (int64): node, heading, key of the simulation's risk outcomes, moves
-made, then one word a tile of 8 x 8 nodes with the bits of those that this simulation has covered. Actions: 0..7 one move
-in that direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule. Observation:
+made, then one word a tile of 8 x 8 nodes with the bits of those that this simulation has covered. Actions: 0..7 one
+move in that direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule. Observation:
 blocked or not, and how much was newly covered, binned. Whether an edge is blocked is drawn once a simulation (a hash
 of its key), so that a blocked edge stays blocked and is worth finding out about.
 """

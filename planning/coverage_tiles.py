@@ -1,8 +1,8 @@
 """Coverage as tiles of 8 x 8 nodes, one 64-bit word a tile, and what a look covers as a short list of such words.
 
 A footprint of 11 x 11 nodes lies in about five tiles, what one step newly shows in two or three: as rows both are
-eleven words. Node (row, column) is bit 8 (row % 8) + column % 8 of tile (row // 8) T + column // 8, with T tiles a side;
-bits of a tile beyond the lattice stay 0. On the wire coverage is rows (`EpisodeRequest.covered`).
+eleven words. Node (row, column) is bit 8 (row % 8) + column % 8 of tile (row // 8) T + column // 8, with T tiles a
+side; bits of a tile beyond the lattice stay 0. On the wire coverage is rows (`EpisodeRequest.covered`).
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -41,6 +41,7 @@ def random_set(rng: np.random.Generator, n: int) -> frozenset[int]:
     return frozenset(np.flatnonzero(rng.random(n) < rng.choice([0.05, 0.5, 1.0])).tolist())
 
 
+@settings(max_examples=40)
 @given(SEEDS, SIZES)
 def test_a_set_of_nodes_as_tiles_as_rows_and_back(seed: int, size: int) -> None:
     lattice = lattice_of(np.ones(size * size))
@@ -55,6 +56,7 @@ def test_a_set_of_nodes_as_tiles_as_rows_and_back(seed: int, size: int) -> None:
     np.testing.assert_array_equal(tiles_of_rows(lattice.bits(nodes), size), tiles)
 
 
+@settings(max_examples=40)
 @given(SEEDS, SIZES)
 def test_the_value_of_a_node_is_found_by_tile_and_bit(seed: int, size: int) -> None:
     values = np.random.default_rng(seed).uniform(size=size * size)
@@ -90,6 +92,7 @@ def problem(seed: int, size: int, sets: int) -> tuple[Reference, list[frozenset[
     return lattice, [random_set(rng, size * size) for _ in range(sets)], by_tile(entropy, size)
 
 
+@settings(max_examples=40)
 @given(SEEDS, SIZES)
 def test_covering_is_set_arithmetic(seed: int, size: int) -> None:
     lattice, sets, entropy = problem(seed, size, 4)
@@ -105,6 +108,7 @@ def test_covering_is_set_arithmetic(seed: int, size: int) -> None:
         assert cover(lists, i, entropy, covered) == 0.0
 
 
+@settings(max_examples=40)
 @given(SEEDS, SIZES)
 def test_differences_are_those_of_sets(seed: int, size: int) -> None:
     lattice, sets, entropy = problem(seed, size, 5)
