@@ -26,12 +26,12 @@ class RewardWeights(BaseModel):
     k_risk: float = Field(5.0, ge=0, le=1000, description="k_rho, per unit of rho: more is more careful.")
     k_turn: float = Field(0.1, ge=0, le=100, description="k_mu, for half a turn (mu = 1).")
     leftover_weight: float = Field(
-        3.0,
+        0.0,
         ge=0,
         le=100,
         description="A patch amid covered ones counts so much more: leaving it costs a way back.",
     )
-    leftover_gain: float = Field(0.3, ge=0, le=0.7, description="Least that an uncovered patch counts, nats.")
+    leftover_gain: float = Field(0.0, ge=0, le=0.7, description="Least that an uncovered patch counts, nats.")
     gamma_per_m: float = Field(0.985, gt=0, le=1, description="Discount for a metre travelled.")
 
 
@@ -64,8 +64,8 @@ def leftover_entropy(
     """Entropy of the nodes of a lattice as the local planners count it: leaving ground behind costs a way back.
 
     entropy: (n,), 0 where covered. known: (n,), traversable nodes. An uncovered patch counts at least leftover_gain,
-    and (1 + leftover_weight f) times, f the share of its known neighbours that are covered. With both at 0 it is the
-    paper's reward; then a planner of finite horizon leaves every sliver for later, as fresh ground pays more at once.
+    and (1 + leftover_weight f) times, f the share of its known neighbours that are covered. With both at 0, the
+    default, it is the paper's reward.
     """
     wanted, traversable = (entropy > 0.0).reshape(size, size), known.reshape(size, size)
     done, neighbours = np.zeros((size, size)), np.zeros((size, size))

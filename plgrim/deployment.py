@@ -9,7 +9,7 @@ from typing import Literal
 from plgrim.config import Config
 from plgrim.errors import ConfigError
 from plgrim.link.config import LinkConfig
-from plgrim.security.access import OPERATOR, ROUTER, TOOLS, writers
+from plgrim.security.access import OPERATOR, RECORDER, ROUTER, TOOLS, writers
 from schemas.topics import LINK, MAY_RUN_AT_BASE, SERVICES
 
 Role = Literal["all", "robot", "base"]
@@ -49,7 +49,7 @@ def processes_of(role: Role, at_base: tuple[str, ...] = USUAL_AT_BASE) -> tuple[
     """Whoever needs a certificate on a host; `sim` also stands for the gateway that writes its topics."""
     link = (LINK,) if role == "robot" else ()
     others = tuple(name for name in writers() if name not in (*SERVICES, LINK))
-    return (ROUTER, *services_of(role, at_base), *link, *others, TOOLS, OPERATOR)
+    return (ROUTER, *services_of(role, at_base), *link, *others, RECORDER, TOOLS, OPERATOR)
 
 
 def started_by_up(config: Config) -> tuple[str, ...]:

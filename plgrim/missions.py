@@ -20,7 +20,7 @@ from plgrim.runtime.router import page_address
 from plgrim.runtime.supervisor import Command, Supervisor, plgrim_command
 from plgrim.runtime.zenoh_session import Link, connect
 from plgrim.security.exposure import check_client
-from plgrim.security.local_token import page_fragment, with_local_token
+from plgrim.security.local_token import page_to_print, with_local_token
 from schemas.base import Message
 from schemas.codec import decode
 from schemas.contract import SECOND_NS, Topic
@@ -90,11 +90,13 @@ def run_live(
     recorder = MissionRecorder(config.seed, world_name(config), "live", config.clock.speed)
     out_dir.mkdir(parents=True, exist_ok=True)
     config = with_local_token(config, out_dir)
-    page = status_page(config) + page_fragment(config)
+    page = status_page(config) if "status" in services else ""
     began = time.monotonic()
     with (
         Supervisor(config, out_dir, services, command, resume) as supervisor,
-        MissionProgress(recorder, page, console) as progress,
+        MissionProgress(
+            recorder, page and page_to_print(page, config, out_dir, console.file), console
+        ) as progress,
     ):
         link = supervisor.start()
         attach_recorder(link, recorder)

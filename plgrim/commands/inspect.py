@@ -57,15 +57,16 @@ def _print(text: str) -> None:
 
 
 def healthcheck(
-    service: Annotated[str, typer.Argument(help="A service, link, or router.")],
+    service: Annotated[str, typer.Argument(help="A service, link, recorder, or router.")],
     config_file: ConfigFile = None,
     timeout: Annotated[float, typer.Option(help="Wall seconds.")] = 3.0,
 ) -> None:
     """Ask a running service end to end whether it makes progress; exit 0 when it does."""
     from plgrim.config import load_config
+    from plgrim.security.access import RECORDER
     from schemas.topics import LINK, SERVICES
 
-    known = (*SERVICES, LINK, "router")
+    known = (*SERVICES, LINK, RECORDER, "router")
     if service not in known:
         raise typer.BadParameter(f"no service {service!r}; there are {', '.join(known)}")
     config = load_config(config_file)
@@ -93,8 +94,10 @@ def _status_trouble(config: Config) -> str:
 def _trouble(config: Config, service: str, timeout_s: float) -> str:
     """Why a service is not healthy, or nothing."""
     from plgrim.errors import NoRouterError
+    from plgrim.recording.session import recorder_instance
     from plgrim.runtime.health import ask_health
     from plgrim.runtime.zenoh_session import connect
+    from plgrim.security.access import RECORDER
     from plgrim.security.exposure import check_client
 
     check_client(config)
@@ -102,7 +105,8 @@ def _trouble(config: Config, service: str, timeout_s: float) -> str:
         with connect(config.router, config.robot, threading.Event(), timeout_s) as link:
             if service == "router":
                 return ""
-            health = ask_health(link, service, timeout_s, config.link.instance(service))
+            own = recorder_instance(config) if service == RECORDER else config.link.instance(service)
+            health = ask_health(link, service, timeout_s, own)
     except NoRouterError as error:
         return str(error)
     if health is None:

@@ -11,7 +11,7 @@ from schemas.contract import SECOND_NS, Stamp
 from schemas.operation import JudgeReport, MissionState, StageHealth
 from schemas.policy import GlobalPolicy, Plan, SafetyState
 from schemas.world import CoverageSummary
-from services.status.events import SAFETY_WORDS
+from services.status.events import SAFETY_WORDS, GivenUp
 
 _MOST = 2000
 _QUIET = frozenset({SafetyState.RUN, SafetyState.DONE, SafetyState.RETURN})
@@ -30,7 +30,7 @@ class EventLog:
     _target: int = -1
     _safety: SafetyState = SafetyState.RUN
     _errors: Counter[str] = field(default_factory=Counter)
-    _given_up: set[tuple[float, float, str]] = field(default_factory=set)
+    _given_up: GivenUp = field(default_factory=GivenUp)
     _lost: bool = False
 
     def observe(self, message: Message, now: Stamp) -> None:
@@ -88,8 +88,5 @@ class EventLog:
             self._add(now, "safety", SAFETY_WORDS[m.safety.value] + why)
 
     def _coverage(self, m: CoverageSummary, now: Stamp) -> None:
-        places = zip(m.unreachable_xy_m.tolist(), m.unreachable_reason, strict=False)
-        listed = {(round(x, 1), round(y, 1), reason) for (x, y), reason in places}
-        for x, y, reason in sorted(listed - self._given_up):
+        for x, y, reason in self._given_up.fresh(m):
             self._add(now, "given up", f"frontier at ({x:.1f}, {y:.1f}) given up: {reason}")
-        self._given_up = listed

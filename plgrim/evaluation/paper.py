@@ -31,16 +31,12 @@ SUBWAYS = ("subway_1x", "subway_2x", "subway_3x")
 FIRST_TUNING_SEED = 101
 """Seeds from here on are for tuning, those below are scored."""
 
-_PLAIN_REWARD = {"leftover_weight": 0.0, "leftover_gain": 0.0}
-
 NBV: Overlay = {
-    "lcp": {"planner": "nbv", "weights": _PLAIN_REWARD},
+    "lcp": {"planner": "nbv"},
     "gcp": {"solver": "hfe", "hfe": {"scopes_m": [], "gain_weight": 0.0}},
-    "reconciler": {"weights": _PLAIN_REWARD},
 }
 """Next best view on the Local IRM. Where nothing in the window is worth its way, it goes to the nearest frontier of the
-Global IRM: the paper lets baselines search both roadmaps; without that it would stand still for good. It counts no
-leftovers: with them it covered less in the same time."""
+Global IRM: the paper lets baselines search both roadmaps; without that it would stand still for good."""
 
 HFE: Overlay = {
     "lcp": {"planner": "hfe"},

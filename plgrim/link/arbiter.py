@@ -93,7 +93,13 @@ class Arbiter:
         if not self.lease.tick(now_ns, base_lags=waited):
             return []
         words = [self._last[key] for key in sorted(self._last) if key[0] == self.lease.holder]
-        return [self._sealed(word, stamp) for word in words if now_ns - word.heard_ns <= _WARM_NS]
+        return [self._sealed(word, stamp) for word in words if self._is_warm(word, now_ns)]
+
+    def _is_warm(self, word: _Word, now_ns: int) -> bool:
+        """Whether a word from before the change of holder still holds: the base's may have aged since it was judged."""
+        if now_ns - word.heard_ns > _WARM_NS:
+            return False
+        return self.lease.holder == STANDBY or self._lag_ns(word, now_ns) <= self.config.ns("behind_after_s")
 
     @property
     def _silent_ns(self) -> int:

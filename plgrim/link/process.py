@@ -23,6 +23,7 @@ from plgrim.link.uplink import Meters, Uplink, Wanted
 from plgrim.logs import get_logger
 from plgrim.runtime.mailbox import Mailbox, Outbox, SharedDecoder
 from plgrim.runtime.service import LiveService
+from plgrim.runtime.zenoh_session import many_receivers
 from plgrim.security.exposure import check_link
 from schemas.base import Message
 from schemas.contract import SECOND_NS, Output, Stamp, Topic
@@ -44,6 +45,7 @@ def run_link(config: Config, stop: threading.Event) -> None:
             "tls/base:7447"
         )
     check_link(config)
+    many_receivers()
     with LiveService(LINK, config, stop) as service:
         LinkProcess(service).run(stop)
 

@@ -10,6 +10,7 @@ import queue
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from plgrim.logs import get_logger
@@ -44,11 +45,16 @@ def raw_of(topic: Topic[Message], envelope: Envelope, payload: bytes) -> Raw:
 
 @dataclass(slots=True)
 class Recorder:
-    """Records from a link into a ring until closed. counts, lost: messages written, and lost by reason."""
+    """Records from a link into a ring until closed.
+
+    instance: which of two instances of a service this host has (`LinkConfig.instance`): its steps are recorded. Of what
+    such a service says, that of the one that is obeyed. counts, lost: messages written, and lost by reason.
+    """
 
     link: Link
     ring: Ring
     translator: Translator | None = field(default_factory=Translator)
+    instance: Callable[[str], str] = field(default=lambda _: "")
     counts: Counter[str] = field(default_factory=Counter)
     lost: Counter[str] = field(default_factory=Counter)
     written_bytes: int = 0
@@ -64,8 +70,10 @@ class Recorder:
         """Subscribe to everything."""
         self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
         self._thread.start()
+        own = {t.name: s for s in STAGES for t in (steps_topic(s), snapshot_topic(s))}
         for topic in recorded_topics():
-            self.link.subscribe(topic, self._receive, every=True)
+            instance = self.instance(own[topic.name]) if topic.name in own else ""
+            self.link.subscribe(topic, self._receive, every=True, instance=instance)
         with self._lock:  # for what another recorder has heard already
             self._behind.update(STAGES)
 
@@ -117,7 +125,8 @@ class Recorder:
         for service in due:
             if service in STAGES:
                 self._asked_s[service] = now
-                self.link.ask(snapshot_query_key(self.link.robot, service), 1.0)
+                key = snapshot_query_key(self.link.robot, service, self.instance(service))
+                self.link.ask(key, 1.0)
 
     def close(self) -> None:
         """Write what has come, and end the segment. Close the link first."""

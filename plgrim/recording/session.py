@@ -14,8 +14,11 @@ from plgrim.recording.recorder import Recorder
 from plgrim.recording.transfer import Fetcher, Offer
 from plgrim.recording.well_known import Translator
 from plgrim.recording.writer import Ring, about
-from plgrim.runtime.zenoh_session import connect
+from plgrim.runtime.health import HealthMonitor, query_key
+from plgrim.runtime.zenoh_session import connect, many_receivers
+from plgrim.security.access import RECORDER
 from plgrim.security.exposure import check_client
+from schemas.codec import Envelope, encode
 
 _LEASE_MS = 20_000
 
@@ -33,16 +36,20 @@ def run_recorder(
 
     base_endpoint: of the base station's router, where the segments are offered too. Raises NoRouterError, ConfigError.
     """
-    check_client(config)
+    check_client(config, RECORDER)
     if base_endpoint:
-        check_client(_at(config, base_endpoint))
+        check_client(_at(config, base_endpoint), RECORDER)
+    many_receivers()
     ring = Ring(folder, about(config.robot, config.seed, world_name(config)), segment_s, max_bytes)
     # A recorder that a busy machine keeps waiting is not gone.
     patient = config.router.model_copy(update={"lease_ms": max(config.router.lease_ms, _LEASE_MS)})
-    link = connect(patient, config.robot, stop, config.runtime.start_timeout_s)
-    Offer(folder).on(link.session, config.robot)
+    link = connect(patient, config.robot, stop, config.runtime.start_timeout_s, RECORDER)
+    if config.link.host != "base":  # there they lie already, and the robot's would be taken for them
+        Offer(folder).on(link.session, config.robot)
     base = _BaseOffer(config, folder, base_endpoint, stop) if base_endpoint else None
-    recorder = Recorder(link, ring, None if raw_only else Translator())
+    recorder = Recorder(link, ring, None if raw_only else Translator(), config.link.instance)
+    health = _Health(config, recorder)
+    link.answer(query_key(config.robot, f"{recorder_instance(config)}/{RECORDER}".lstrip("/")), health.answer)
     try:
         recorder.start()
         get_logger().info("records", folder=str(folder))
@@ -55,6 +62,28 @@ def run_recorder(
         recorder.close()
     get_logger().info("recorded", messages=sum(recorder.counts.values()), lost=dict(recorder.lost))
     return recorder.counts, recorder.lost
+
+
+def recorder_instance(config: Config) -> str:
+    """`base` for the base's recorder: the robot's may be heard at the same router."""
+    return "base" if config.link.host == "base" else ""
+
+
+class _Health:
+    """Answers health checks: ready while the disk takes what comes. steps: messages written."""
+
+    def __init__(self, config: Config, recorder: Recorder) -> None:
+        self._robot, self._recorder, self._asked = config.robot, recorder, 0
+        self._monitor = HealthMonitor(RECORDER)
+
+    def answer(self) -> bytes:
+        """The health of this moment, as a message."""
+        recorder, monitor = self._recorder, self._monitor
+        self._asked += 1
+        monitor.steps = sum(recorder.counts.values())
+        monitor.ready, monitor.last_error = not recorder.ring.trouble, recorder.ring.trouble[:500]
+        health = monitor.report(0, dict(recorder.lost), [])
+        return encode(health, Envelope(self._robot, RECORDER, 1, self._asked, 0))
 
 
 def _at(config: Config, endpoint: str) -> Config:
@@ -75,7 +104,7 @@ class _BaseOffer(threading.Thread):
         """Connect when the base is there; Zenoh connects again after a cut."""
         while not self._ended.is_set():
             try:
-                with connect(self._router, self._robot, self._ended, 5.0) as link:
+                with connect(self._router, self._robot, self._ended, 5.0, RECORDER) as link:
                     Offer(self._folder).on(link.session, self._robot)
                     self._ended.wait()
             except NoRouterError:

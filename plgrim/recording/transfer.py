@@ -20,6 +20,7 @@ from plgrim.logs import get_logger
 from plgrim.recording.errors import RecordingError
 from plgrim.recording.writer import PART, segments
 from plgrim.runtime.zenoh_session import Link
+from plgrim.security.access import SEGMENTS_QUERY
 from schemas.contract import root_of
 
 _PIECE_BYTES = 64 * 1024
@@ -27,7 +28,7 @@ _PIECE_BYTES = 64 * 1024
 
 def segments_key(robot: str) -> str:
     """Key on which a recorder answers with its segments, and with a piece of one: `?name=...;offset=...`."""
-    return f"{root_of(robot)}/record/segments"
+    return f"{root_of(robot)}/{SEGMENTS_QUERY}"
 
 
 @dataclass(slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from planning.frames import Planar, in_map, planar
 from planning.graph_mirror import FRONTIER, GraphMirror
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS, Stamp
-from schemas.operation import JudgeReport, WorldPicture
+from schemas.operation import FinishReason, JudgeReport, MissionState, WorldPicture
 from schemas.policy import GlobalPolicy, Plan
 from schemas.sensing import Odometry
 from schemas.world import CoverageWindow, GlobalIrm
@@ -29,12 +30,15 @@ _UNKNOWN, _SOLID, _GROUND, _SEEN, _FAR = (
 _WINDOW_COLOURS = np.array([_UNKNOWN, _GROUND, _SEEN, _SOLID, _FAR], np.uint8)
 _WORLD_GHOST, _WORLD_ROCK = (255, 255, 255), (225, 229, 234)
 _PATH, _EDGE, _CRUMB, _EDGE_OF, _TARGET, _PLAN, _INK = (
-    (194, 65, 12), (120, 144, 190), (59, 92, 160), (217, 119, 6), (190, 18, 60), (29, 78, 216), (31, 41, 51),
+    (194, 65, 12), (146, 175, 196), (59, 92, 160), (217, 119, 6), (190, 18, 60), (29, 78, 216), (31, 41, 51),
 )  # fmt: skip
+_LEGEND = ("robot", "driven", "plan", "target", "frontier", "road map", "covered", "to cover", "obstacle")
+LEGEND_PX, _LEGEND_FONT = 22, 13
+"""Height of the line below the map that says what is what, and its letters'."""
 SHOWN = frozenset(
     {
         "sim/world_picture", "irm/coverage_window", "irm/global_irm", "sim/odometry", "gcp/global_policy",
-        "reconciler/plan", "sim/judge",
+        "reconciler/plan", "sim/judge", "mission/state",
     }
 )  # fmt: skip
 """Topics that a frame is made of."""
@@ -90,6 +94,7 @@ class FrameMaker:
     _plan: Plan | None = None
     _judge: JudgeReport | None = None
     _driven: list[tuple[float, float]] = field(default_factory=list)
+    _over: bool = False
     _due_ns: Stamp = 0
     _first_ns: Stamp = -1
 
@@ -111,6 +116,8 @@ class FrameMaker:
                 self._plan = message
             case JudgeReport():
                 self._judge = message
+            case MissionState():
+                self._over = message.finish is not FinishReason.NONE
         if self._canvas is not None and self._odometry is not None and now >= self._due_ns:
             self._first_ns = now if self._first_ns < 0 else self._first_ns
             self._due_ns = now + int(self.every_s * SECOND_NS)
@@ -161,9 +168,12 @@ class FrameMaker:
             pen.line(canvas.px(np.array(self._driven)), fill=_PATH, width=3 * _SCALE, joint="curve")
         self._draw_plan(pen, canvas)
         self._draw_robot(pen, canvas)
-        small = image.resize(canvas.size, Image.Resampling.LANCZOS)
-        self._write(ImageDraw.Draw(small), now)
-        return small
+        width, height = canvas.size
+        picture = Image.new("RGB", (width, height + LEGEND_PX), _WORLD_GHOST)
+        picture.paste(image.resize(canvas.size, Image.Resampling.LANCZOS))
+        picture.paste(_legend(width), (0, height))
+        self._write(ImageDraw.Draw(picture), now)
+        return picture
 
     def _draw_graph(self, pen: ImageDraw.ImageDraw, canvas: _Canvas) -> None:
         graph = self._graph.road_map()
@@ -175,20 +185,18 @@ class FrameMaker:
                 if a < b and graph.kind[a] != FRONTIER and graph.kind[b] != FRONTIER:
                     pen.line([places[a], places[b]], fill=_EDGE, width=_SCALE)
         for (x, y), kind in zip(places, graph.kind.tolist(), strict=True):
-            if kind == FRONTIER:  # a diamond: told apart by shape, not by colour alone
-                d = 4.5 * _SCALE
-                pen.polygon(
-                    [(x - d, y), (x, y - d), (x + d, y), (x, y + d)], fill=_EDGE_OF, outline=(255, 255, 255)
-                )
+            if kind == FRONTIER:
+                _diamond(pen, x, y)
             else:
                 d = 1.6 * _SCALE
                 pen.ellipse([x - d, y - d, x + d, y + d], fill=_CRUMB)
 
     def _draw_plan(self, pen: ImageDraw.ImageDraw, canvas: _Canvas) -> None:
         policy, plan, odometry = self._policy, self._plan, self._odometry
+        if self._over:
+            return
         if policy is not None and policy.target >= 0:
-            (x, y), d = canvas.px(np.array([policy.target_xyz_m[:2]]))[0], 8 * _SCALE
-            pen.ellipse([x - d, y - d, x + d, y + d], outline=_TARGET, width=2 * _SCALE)
+            _ring(pen, *canvas.px(np.array([policy.target_xyz_m[:2]]))[0])
         if plan is not None and plan.valid and odometry is not None and len(plan.x_m) > 1:
             frame = odometry.map_to_odom
             points = [
@@ -200,11 +208,7 @@ class FrameMaker:
         if self._odometry is None:
             return
         x, y, yaw = in_map(self._odometry.map_to_odom, self._odometry.pose)
-        (px, py), d = canvas.px(np.array([[x, y]]))[0], 7.0 * _SCALE
-        turned = [yaw, yaw + 2.5, yaw - 2.5]
-        pen.polygon(
-            [(px + d * np.cos(a), py - d * np.sin(a)) for a in turned], fill=_INK, outline=(255, 255, 255)
-        )
+        _arrow(pen, *canvas.px(np.array([[x, y]]))[0], yaw)
 
     def _write(self, pen: ImageDraw.ImageDraw, now: Stamp) -> None:
         text = f"{(now - max(0, self._first_ns)) / SECOND_NS:.0f} s"
@@ -230,3 +234,57 @@ class FrameMaker:
 def _compose(frame: Pose, x: float, y: float) -> tuple[float, float]:
     at = planar(frame).compose(Planar(x, y, 0.0))
     return at.x_m, at.y_m
+
+
+def _diamond(pen: ImageDraw.ImageDraw, x: float, y: float) -> None:
+    """A frontier: told apart by shape, not by colour alone."""
+    d = 4.5 * _SCALE
+    pen.polygon([(x - d, y), (x, y - d), (x + d, y), (x, y + d)], fill=_EDGE_OF, outline=(255, 255, 255))
+
+
+def _ring(pen: ImageDraw.ImageDraw, x: float, y: float) -> None:
+    """The target."""
+    d = 8 * _SCALE
+    pen.ellipse([x - d, y - d, x + d, y + d], outline=_TARGET, width=2 * _SCALE)
+
+
+def _arrow(pen: ImageDraw.ImageDraw, x: float, y: float, yaw: float) -> None:
+    """The robot, with a white rim wide enough to be found on anything."""
+    for d, colour in ((11.0 * _SCALE, (255, 255, 255)), (8.0 * _SCALE, _INK)):
+        turned = [yaw, yaw + 2.5, yaw + np.pi, yaw - 2.5]
+        reach = [d, d, 0.35 * d, d]
+        points = [(x + r * np.cos(a), y - r * np.sin(a)) for a, r in zip(turned, reach, strict=True)]
+        pen.polygon(points, fill=colour)
+
+
+@cache
+def _legend(width: int) -> Image.Image:
+    """What is what, in a line; from the left as far as it fits."""
+    large = Image.new("RGB", (width * _SCALE, LEGEND_PX * _SCALE), _WORLD_GHOST)
+    pen, x, y = ImageDraw.Draw(large), 12.0 * _SCALE, LEGEND_PX * _SCALE / 2
+    size = _LEGEND_FONT * _SCALE
+    for word in _LEGEND:
+        wide = pen.textlength(word, font_size=size)
+        if x + 12 * _SCALE + wide > width * _SCALE:
+            break
+        _sign(pen, word, x, y)
+        pen.text((x + 12 * _SCALE, y), word, fill=_INK, font_size=size, anchor="lm")
+        x += wide + 33 * _SCALE
+    return large.resize((width, LEGEND_PX), Image.Resampling.LANCZOS)
+
+
+def _sign(pen: ImageDraw.ImageDraw, word: str, x: float, y: float) -> None:
+    """A word's sign of the legend, its middle at a pixel of the large picture."""
+    d = 6 * _SCALE
+    lines = {"driven": (_PATH, 3), "plan": (_PLAN, 2), "road map": (_EDGE, 1)}
+    areas = {"covered": _SEEN, "to cover": _GROUND, "obstacle": _SOLID}
+    if word in lines:
+        pen.line([x - d, y, x + d, y], fill=lines[word][0], width=lines[word][1] * _SCALE)
+    elif word in areas:
+        pen.rectangle([x - d, y - d, x + d, y + d], fill=areas[word])
+    elif word == "target":
+        _ring(pen, x, y)
+    elif word == "frontier":
+        _diamond(pen, x, y)
+    else:
+        _arrow(pen, x, y, 0.0)

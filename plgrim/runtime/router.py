@@ -14,7 +14,7 @@ from plgrim.errors import PlgrimError, PortTakenError
 from plgrim.hosts import SECURE, host_and_port, protocol
 from plgrim.logs import get_logger
 from plgrim.runtime.pulse import Pulse
-from plgrim.runtime.zenoh_session import open_config, session_config
+from plgrim.runtime.zenoh_session import many_receivers, open_config, session_config
 from plgrim.security.access import ROUTER, every_topic
 from plgrim.security.exposure import check_router
 from plgrim.security.policy import router_access
@@ -80,6 +80,7 @@ def run_router(config: Config, stop: threading.Event) -> None:
     Raises ConfigError, PortTakenError.
     """
     settings = router_settings(config)
+    many_receivers()
     endpoints = [config.router.endpoint, *config.router.listen]
     for endpoint in endpoints:
         check_endpoint_free(endpoint)

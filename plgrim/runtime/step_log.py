@@ -30,9 +30,10 @@ _LONGEST_BACKLOG = 100_000
 """Arrivals noted between two steps; more are a stage that does not step, and then its next snapshot says it all."""
 
 
-def snapshot_query_key(robot: str, service: str) -> str:
-    """Key on which a service takes a recorder's wish for a snapshot."""
-    return f"{root_of(robot)}/{service}/snapshot_now"
+def snapshot_query_key(robot: str, service: str, instance: str = "") -> str:
+    """Key on which a service, or one of two instances of it, takes a recorder's wish for a snapshot."""
+    path = f"{instance}/{service}" if instance else service
+    return f"{root_of(robot)}/{path}/snapshot_now"
 
 
 class NotedStopwatch:
@@ -89,7 +90,7 @@ class StepLog:
         self._link, self._outbox = link, outbox
         link.declare(steps_topic(self.service))
         link.declare(snapshot_topic(self.service))
-        link.answer(snapshot_query_key(link.robot, self.service), self._ask)
+        link.answer(snapshot_query_key(link.robot, self.service, link.instance), self._ask)
 
     def _ask(self) -> bytes:
         """A recorder asks for a snapshot: it has missed something."""

@@ -9,6 +9,7 @@ threads; `Link.close` waits for them, since a thread that sits in Zenoh while th
 from __future__ import annotations
 
 import json
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -35,7 +36,17 @@ _LARGE_CACHE = 8
 _LARGE_BYTES = 1024 * 1024
 _OPEN_TIMEOUT_MS = 2000
 _SERVED_AT_ONCE = 8
+_RECEIVERS = 16
 Receive = Callable[[Topic[Message], bytes], None]
+
+
+def many_receivers() -> None:
+    """Give this process more of Zenoh's receiving threads; before its first session, for one with several connections.
+
+    Zenoh has two of them for all connections of a process, and closes a connection on one of them. Where its peer is
+    gone and data is unsent, that takes ten seconds (SO_LINGER): two dead connections, and nothing is received.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVERS}))")
 
 
 def session_config(router: RouterConfig, mode: str, process: str = TOOLS) -> dict[str, Any]:
@@ -61,7 +72,8 @@ def session_config(router: RouterConfig, mode: str, process: str = TOOLS) -> dic
         "timestamping": {"enabled": False},
         "queries_default_timeout": 1000,
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "adminspace": {"enabled": False},
+        # Without permissions too: a stock zenohd switches it on, whatever its file says.
+        "adminspace": {"enabled": False, "permissions": {"read": False, "write": False}},
         "transport": {
             "shared_memory": {"enabled": router.shared_memory},
             "unicast": {"open_timeout": 1500, "accept_timeout": 1500},

@@ -15,12 +15,17 @@ from schemas.contract import Topic, root_of
 from schemas.topics import LINK, SERVICES, TOPICS, health_topic, recorder_topics
 
 TOOLS = "tools"
-"""The name under which `plgrim watch`, `healthcheck`, `record` and the supervisor read along. They
-write no topic; a recorder hands out its segments."""
+"""The name under which `plgrim watch`, `healthcheck`, `fetch` and their like read along. They write no topic."""
+RECORDER = "recorder"
+"""The name of `plgrim record`: it reads along, asks for snapshots, and hands out its segments."""
+ROBOT_RECORDER = "robot_recorder"
+"""The robot's recorder as the base's router knows it."""
 OPERATOR = "operator"
 """The name under which `plgrim pause`, `home`, `geofence` and their like steer the mission."""
 COMMAND_QUERY = "mission/command"
 """What they ask; the status service answers it, after the mission has."""
+SEGMENTS_QUERY = "record/segments"
+"""What `plgrim fetch` asks; the robot's recorder answers it."""
 ROUTER = "router"
 
 
@@ -74,8 +79,20 @@ def tools_grant(robot: str) -> Grant:
     """Of those who look on: they read everything and write nothing."""
     root = root_of(robot)
     asked = tuple(f"{root}/**/{query}" for query in ("health_now", "snapshot_now"))
-    segments = f"{root}/record/segments"
-    return Grant(reads=(f"{root}/**",), answers=(segments,), asks=(*asked, segments), watches=(f"{root}/**",))
+    segments = f"{root}/{SEGMENTS_QUERY}"
+    return Grant(reads=(f"{root}/**",), asks=(*asked, segments), watches=(f"{root}/**",))
+
+
+def recorder_grant(robot: str) -> Grant:
+    """Of a host's recorder: it reads everything; of what it says, nothing is a topic."""
+    root = root_of(robot)
+    answers = (f"{root}/{SEGMENTS_QUERY}", *(f"{root}/{i}{RECORDER}/health_now" for i in ("", "base/")))
+    return Grant(reads=(f"{root}/**",), answers=answers, asks=(f"{root}/**/snapshot_now",))
+
+
+def robot_recorder_grant(robot: str) -> Grant:
+    """Of the robot's recorder at the base's router: it hands out its segments there, no more."""
+    return Grant(answers=(f"{root_of(robot)}/{SEGMENTS_QUERY}",))
 
 
 def operator_grant(robot: str) -> Grant:

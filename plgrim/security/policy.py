@@ -11,6 +11,8 @@ from plgrim.link.config import LinkConfig
 from plgrim.link.routes import down, keys_written, leased_outputs, up_plain
 from plgrim.security.access import (
     OPERATOR,
+    RECORDER,
+    ROBOT_RECORDER,
     ROUTER,
     TOOLS,
     Grant,
@@ -18,11 +20,15 @@ from plgrim.security.access import (
     certificate_name,
     everything_grant,
     operator_grant,
+    recorder_grant,
+    robot_recorder_grant,
     service_grant,
     tools_grant,
 )
 from schemas.topics import LINK, SERVICES
 
+FROM_ROBOT = {LINK: LINK, ROBOT_RECORDER: RECORDER}
+"""Who comes to the base's router from the robot, and by what process's certificate."""
 _PLAIN_PROTOCOLS = ["tcp", "ws", "unixsock-stream"]
 
 
@@ -43,17 +49,19 @@ def router_access(config: Config) -> dict[str, Any]:
 
 
 def clients_of(config: Config) -> tuple[str, ...]:
-    """Whoever may connect to this host's router; the link comes to both hosts."""
+    """Whoever may connect to this host's router; the link comes to both hosts, and a recorder may."""
     role = role_of(config)
     found = [name for name in processes_of(role, config.link.at_base) if name != ROUTER]
-    return (*found, *([LINK] if role == "base" else []))
+    return (*found, *(FROM_ROBOT if role == "base" else ()))
 
 
 def certificate_names(config: Config) -> dict[str, str]:
-    """The names of those certificates that this host's router knows, by process. The link has that of the robot."""
+    """The names of those certificates that this host's router knows, by process."""
     role = role_of(config)
     return {
-        process: certificate_name(process, "robot" if process == LINK else role, config.robot)
+        process: certificate_name(FROM_ROBOT[process], "robot", config.robot)
+        if process in FROM_ROBOT and role == "base"
+        else certificate_name(process, role, config.robot)
         for process in clients_of(config)
     }
 
@@ -68,6 +76,10 @@ def grant_of(process: str, config: Config) -> Grant:
     robot, role = config.robot, role_of(config)
     if process == TOOLS:
         return tools_grant(robot)
+    if process == RECORDER:
+        return recorder_grant(robot)
+    if process == ROBOT_RECORDER:
+        return robot_recorder_grant(robot)
     if process == OPERATOR:
         return operator_grant(robot)
     if process == LINK:

@@ -21,6 +21,7 @@ from schemas.topics import GCP_GRAPH_REQUEST, GLOBAL_IRM, GLOBAL_POLICY, MISSION
 from schemas.world import GraphRequest
 from services.gcp.config import Config
 from services.gcp.hfe import frontier_options, scope_of
+from services.gcp.net import empty_net, move_pool
 from services.gcp.orienteering import Outlook, Visits
 from services.gcp.planner import Belief, Floats, GlobalPlanner, Option, Slots
 from services.gcp.roadnet import Graph, RoadNet
@@ -371,3 +372,4 @@ def warm_up() -> None:
         planner.policy(roads.near(np.zeros(3), 2.0), np.zeros(3), 0.5)
         planner.way_home(middle, roads.slot_of(1))
         frontier_options(roads, middle, (), 1.0, 1.0, 1, ())
+    move_pool(roads.net, empty_net(0, 2 * roads.net.other.size))  # what a graph does that outgrows its pool

@@ -43,13 +43,14 @@ from services.irm.ground import GroundStore
 from services.irm.keyframes import Anchor, Keyframes, OdomInMap, is_near
 from services.irm.local_irm import LocalIrmBuilder
 from services.irm.out_of_reach import FENCED, OutOfReach
+from services.irm.rehearsal import rehearse
 from services.irm.resample import moved
 from services.irm.roadmap import Roadmap
 from services.irm.tiles import TileLayer
 from services.irm.unknown import expected_area_m2
 from services.irm.window import Window, build_window, grid_of, read_layer, relief_of, window_picture
 
-__all__ = ["Config", "IrmStage", "create", "spec"]
+__all__ = ["Config", "IrmStage", "create", "spec", "warm_up"]
 
 _BLOCKED_AGAIN_NS = 5 * SECOND_NS
 """Blocked at one place again after so long, it counts once more,"""
@@ -74,6 +75,11 @@ def spec(config: Config) -> StageSpec:
 def create(config: Config, setup: StageSetup) -> Stage:
     """An irm stage."""
     return IrmStage(config)
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them: before the stage is ready, not in its first steps."""
+    rehearse(IrmStage(Config(size=11, sensor_range_m=3.0)))
 
 
 class IrmStage:

@@ -47,11 +47,12 @@ from services.reconciler.episode import (
 )
 from services.reconciler.following import Driven
 from services.reconciler.path import STEP_M, Ground, fenced_ground, headings, resample, speeds
+from services.reconciler.rehearsal import rehearse
 from services.reconciler.safety import SafetyInputs, SafetyLimits, Verdict, judge
 from services.reconciler.separation import Guard
 from services.reconciler.tau import choose_tau, tau_terms
 
-__all__ = ["Config", "ReconcilerStage", "create", "spec"]
+__all__ = ["Config", "ReconcilerStage", "create", "spec", "warm_up"]
 
 _NO_POINTS = np.zeros((0, 2))
 _KEPT = (
@@ -74,6 +75,11 @@ def spec(config: Config) -> StageSpec:
 def create(config: Config, setup: StageSetup) -> Stage:
     """A reconciler stage."""
     return ReconcilerStage(config, setup.seed)
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them: before the stage is ready, not in its first steps."""
+    rehearse(ReconcilerStage(Config(), 0))
 
 
 class ReconcilerStage:

@@ -41,6 +41,8 @@ _FOOT_M = 0.05
 _TRUSTED_POINTS = 4.0
 """From so many points a cell's ground is the authority on what stands above it."""
 
+ITSELF_M = 0.15
+"""A point that is no farther from supposed ground is that ground: what stands there has points higher up, too."""
 BOUND_TOLERANCE_M = 0.05
 """Rays pass so much below supposed ground before it is taken for wrong, m."""
 
@@ -285,3 +287,6 @@ def suppose(cell: NDArray[np.float32], z: float, variance: float, rules: GroundR
     if cell[VARIANCE] == 0.0 or (cell[SEEN] == 0.0 and variance < variance_now(cell, rules)):
         cell[MEAN], cell[VARIANCE] = z, variance
         cell[SEEN], cell[TRAVELLED] = 0.0, rules.travelled_m
+    # What was seen at this height while nothing led there was this ground, not something over it.
+    if cell[SEEN] == 0.0 and cell[CEILING_SEEN] > 0.0 and abs(cell[CEILING] - cell[MEAN]) <= ITSELF_M:
+        cell[CEILING_SEEN] = 0.0

@@ -19,8 +19,9 @@ from services.riskmap.cells import (
     LOG_ODDS,
     MEAN,
     SEEN,
+    VARIANCE,
 )
-from services.riskmap.ground import GroundRules, slot
+from services.riskmap.ground import ITSELF_M, GroundRules, slot
 from services.riskmap.sweep import BEARINGS, Sweep
 
 _PIERCED_M = 0.02
@@ -62,6 +63,8 @@ def add_hits(
             if over > rules.height_m:
                 # Far up a slope, where a sweep misses what leads there: ground that was seen is no ceiling of itself.
                 if cell[SEEN] > 0.0 and z - cell[MEAN] <= rules.height_m:
+                    continue
+                if cell[SEEN] == 0.0 and cell[VARIANCE] > 0.0 and abs(z - cell[MEAN]) <= ITSELF_M:
                     continue
                 cell[CEILING] = z if cell[CEILING_SEEN] == 0.0 else min(z, cell[CEILING])
                 cell[CEILING_SEEN] = min(cell[CEILING_SEEN] + 1.0, 1e6)

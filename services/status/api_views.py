@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import PlainTextResponse, StreamingResponse
 from pydantic import BaseModel
 
+from planning.graph_mirror import RoadMap
 from schemas.world import RiskMap
-from services.status.core import StatusCore
 from services.status.events import Event
-from services.status.geojson import FeatureCollectionOut, graph_geojson, graph_graphml
+from services.status.geojson import FeatureCollectionOut, graph_graphml, graph_json
 from services.status.history import CoverageCurve, CoveragePoint
 from services.status.layers import Layer, coverage_layer, layer_pgm, layer_png, layer_yaml, risk_layer
+from services.status.once import Once
 from services.status.planners import planner_report
 from services.status.problems import ProblemError, finite
 from services.status.report import PlannerReport, StatusReport
@@ -42,6 +43,14 @@ class EventList(BaseModel):
     last_id: int
 
 
+class _Drawn(NamedTuple):
+    """A layer as a file, with the frame it lies in."""
+
+    frame: str
+    resolution_m: float
+    content: bytes | str
+
+
 def _content(
     kind: str, says: str, more: dict[int | str, dict[str, Any]] | None = None
 ) -> dict[int | str, Any]:
@@ -50,7 +59,7 @@ def _content(
     return {200: {"content": {kind: {"schema": schema}}, "description": says}, **(more or {})}
 
 
-def view_routes(shared: SharedStatus) -> APIRouter:
+def view_routes(shared: SharedStatus, once: Once) -> APIRouter:
     """The routes under /api/v1 that change nothing."""
     api = APIRouter(prefix="/api/v1", dependencies=[Depends(require_viewer)])
 
@@ -75,17 +84,21 @@ def view_routes(shared: SharedStatus) -> APIRouter:
         """Target and the best alternatives with gain, distance, risk and Q; the policy; tau; the local search."""
         return shared.read(planner_report)
 
-    _graph_routes(api, shared)
-    _layer_routes(api, shared)
+    _graph_routes(api, shared, once)
+    _layer_routes(api, shared, once)
     _event_routes(api, shared)
     return api
 
 
-def _graph_routes(api: APIRouter, shared: SharedStatus) -> None:
-    @api.get("/graph.geojson", tags=["map"])
-    def graph_as_geojson() -> FeatureCollectionOut:
+def _graph_routes(api: APIRouter, shared: SharedStatus, once: Once) -> None:
+    def graph_as(write: Callable[[int, RoadMap], bytes]) -> bytes:
+        return write(*shared.read(lambda core, now_ns: core.graph))
+
+    @api.get("/graph.geojson", tags=["map"], response_model=FeatureCollectionOut)
+    async def graph_as_geojson() -> Response:
         """The Global IRM as GeoJSON, in metres of `map`."""
-        return graph_geojson(*shared.read(lambda core, now_ns: core.graph))
+        text = await once.get("geojson", lambda: graph_as(graph_json))
+        return Response(text, media_type="application/json")
 
     @api.get(
         "/graph.graphml",
@@ -93,32 +106,34 @@ def _graph_routes(api: APIRouter, shared: SharedStatus) -> None:
         response_class=Response,
         responses=_content("application/graphml+xml", "GraphML"),
     )
-    def graph_as_graphml() -> Response:
+    async def graph_as_graphml() -> Response:
         """The Global IRM as GraphML: `networkx.read_graphml` and Gephi open it."""
-        text = graph_graphml(*shared.read(lambda core, now_ns: core.graph))
+        text = await once.get("graphml", lambda: graph_as(graph_graphml))
         return Response(text, media_type="application/graphml+xml", headers=NO_STORE)
 
 
-def _layer(core: StatusCore, name: LayerName) -> Layer:
+def _layer(shared: SharedStatus, name: LayerName) -> Layer:
     """A layer as it is now. Raises ProblemError."""
     if name is LayerName.RISK:
-        risk = core.latest("riskmap/risk_map", RiskMap)
+        risk = shared.read(lambda core, now_ns: core.latest("riskmap/risk_map", RiskMap))
         if risk is not None:
             return risk_layer(risk)
     else:
-        whole = core.canvas.whole()
+        whole = shared.read(lambda core, now_ns: core.canvas.whole())
         if whole is not None:
             return coverage_layer(*whole)
     raise ProblemError(404, f"there is no {name.value} layer yet: nothing has been seen")
 
 
-def _layer_routes(api: APIRouter, shared: SharedStatus) -> None:
+def _layer_routes(api: APIRouter, shared: SharedStatus, once: Once) -> None:
     missing: dict[int | str, dict[str, Any]] = {404: {"description": "Nothing has been seen yet."}}
 
-    def current(layer: LayerName) -> Layer:
-        return shared.read(lambda core, now_ns: _layer(core, layer))
+    async def made(name: LayerName, ending: str, draw: Callable[[Layer], bytes | str]) -> _Drawn:
+        def make() -> _Drawn:
+            found = _layer(shared, name)
+            return _Drawn(found.frame, found.spec.resolution_m, draw(found))
 
-    asked = Depends(current)
+        return await once.get(f"{name.value}.{ending}", make)
 
     @api.get(
         "/layers/{layer}.png",
@@ -126,10 +141,11 @@ def _layer_routes(api: APIRouter, shared: SharedStatus) -> None:
         response_class=Response,
         responses=_content("image/png", "A pixel a cell", missing),
     )
-    def layer_as_png(found: Layer = asked) -> Response:
+    async def layer_as_png(layer: LayerName) -> Response:
         """A layer as a picture, a pixel a cell, the highest y at the top; unknown cells are transparent."""
-        headers = {**NO_STORE, "X-Frame": found.frame, "X-Resolution-M": f"{found.spec.resolution_m:.9g}"}
-        return Response(layer_png(found), media_type="image/png", headers=headers)
+        drawn = await made(layer, "png", layer_png)
+        headers = {**NO_STORE, "X-Frame": drawn.frame, "X-Resolution-M": f"{drawn.resolution_m:.9g}"}
+        return Response(drawn.content, media_type="image/png", headers=headers)
 
     @api.get(
         "/layers/{layer}.pgm",
@@ -137,9 +153,10 @@ def _layer_routes(api: APIRouter, shared: SharedStatus) -> None:
         response_class=Response,
         responses=_content("image/x-portable-graymap", "The image", missing),
     )
-    def layer_as_pgm(found: Layer = asked) -> Response:
+    async def layer_as_pgm(layer: LayerName) -> Response:
         """The image of the map_server file."""
-        return Response(layer_pgm(found), media_type="image/x-portable-graymap", headers=NO_STORE)
+        drawn = await made(layer, "pgm", layer_pgm)
+        return Response(drawn.content, media_type="image/x-portable-graymap", headers=NO_STORE)
 
     @api.get(
         "/layers/{layer}.yaml",
@@ -147,9 +164,10 @@ def _layer_routes(api: APIRouter, shared: SharedStatus) -> None:
         response_class=PlainTextResponse,
         responses=_content("application/yaml", "The map_server file", missing),
     )
-    def layer_as_yaml(found: Layer = asked) -> Response:
+    async def layer_as_yaml(layer: LayerName) -> Response:
         """The map_server file (YAML) of a layer; its image is the same name with .pgm."""
-        return Response(layer_yaml(found), media_type="application/yaml", headers=NO_STORE)
+        drawn = await made(layer, "yaml", layer_yaml)
+        return Response(drawn.content, media_type="application/yaml", headers=NO_STORE)
 
 
 def _event_routes(api: APIRouter, shared: SharedStatus) -> None:

@@ -1,7 +1,4 @@
-"""The status over HTTP: a thin adapter of `StatusCore`.
-
-The page at `/` and all answers need nothing from elsewhere; only `/docs` loads its script from a CDN.
-"""
+"""The status over HTTP: a thin adapter of `StatusCore`. Its pages and answers need nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -21,6 +18,7 @@ from services.status.api_views import NO_STORE, view_routes
 from services.status.board import Board
 from services.status.live import Painter
 from services.status.live_socket import add_live
+from services.status.once import Once
 from services.status.page import add_page
 from services.status.problems import FiniteJSONResponse, install
 from services.status.report import Readiness
@@ -79,12 +77,15 @@ def create_app(shared: SharedStatus) -> FastAPI:
         version="1",
         description=_DESCRIPTION,
         openapi_tags=_TAGS,
+        docs_url=None,  # FastAPI's own pages load their scripts from a CDN: see page.py
+        redoc_url=None,
         default_response_class=FiniteJSONResponse,
     )
     secure(app, shared.config)
     install(app)
     _health_routes(app, shared)
-    app.include_router(view_routes(shared))
+    once = Once()
+    app.include_router(view_routes(shared, once))
     app.include_router(mission_routes(shared))
     viewer = [Depends(require_viewer)]
 
@@ -95,14 +96,15 @@ def create_app(shared: SharedStatus) -> FastAPI:
         responses={200: {"content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}},
         dependencies=viewer,
     )
-    def map_png() -> Response:
+    async def map_png() -> Response:
         """The map as far as it is known, with the driven path, the plan and the target."""
-        return Response(shared.picture_png(), media_type="image/png", headers=NO_STORE)
+        picture = await once.get("map.png", shared.picture_png)
+        return Response(picture, media_type="image/png", headers=NO_STORE)
 
     @app.get("/metrics", response_class=Response, include_in_schema=False, dependencies=viewer)
-    def metrics() -> Response:
+    async def metrics() -> Response:
         """For Prometheus."""
-        return Response(shared.metrics(), media_type=CONTENT_TYPE_LATEST)
+        return Response(await once.get("metrics", shared.metrics), media_type=CONTENT_TYPE_LATEST)
 
     add_live(app, LiveStatus(shared), [Depends(require_viewer_socket)])
     add_page(app)

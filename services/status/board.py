@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import threading
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,6 +12,8 @@ import msgpack
 
 _GONE = msgpack.packb(None)
 _KEPT_FRAMES = 8
+_KEPT_GONE = 256
+"""So many parts are remembered as gone. A browser that has not heard of an older one gets everything."""
 
 
 @dataclass(slots=True)
@@ -35,6 +38,8 @@ class Board:
     version: int = 0
     _parts: dict[str, _Part] = field(default_factory=dict)
     _frames: dict[int, bytes] = field(default_factory=dict)
+    _gone: deque[str] = field(default_factory=deque)
+    _forgot: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def put(self, key: str, value: Any) -> None:
@@ -59,6 +64,18 @@ class Board:
             self.version += 1
             self._parts[key] = _Part(self.version, packed)
             self._frames.clear()
+            if packed == _GONE:
+                self._forget(key)
+
+    def _forget(self, key: str) -> None:
+        """This part has gone; the one that went longest ago is not told any more when there are many."""
+        self._gone.append(key)
+        if len(self._gone) > _KEPT_GONE:
+            oldest = self._gone.popleft()
+            part = self._parts[oldest]
+            if part.packed == _GONE and oldest not in self._gone:
+                self._forgot = max(self._forgot, part.version)
+                del self._parts[oldest]
 
     def frame(self, since: int) -> bytes:
         """One frame: {boot, version, full, parts}. since: version that the browser has; 0: everything.
@@ -74,11 +91,11 @@ class Board:
             return made
 
     def _make(self, since: int) -> bytes:
-        full = since <= 0
+        full = since <= 0 or since < self._forgot
         chosen = [
             (key, part.packed)
             for key, part in self._parts.items()
-            if part.version > since and not (full and part.packed == _GONE)
+            if (full or part.version > since) and not (full and part.packed == _GONE)
         ]
         packer = msgpack.Packer(autoreset=False)
         packer.pack_map_header(4)

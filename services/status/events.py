@@ -20,6 +20,8 @@ from schemas.world import CoverageSummary
 _LOG_2 = math.log(2.0)
 _LOW_RISK, _HIGH_RISK = 0.1, 0.3
 _SAME_M = 1.0
+_TOLD_S = 180
+"""A place that was given up counts as told for so long after it was last listed."""
 _AT_REST = ("idle", "paused", "stopped", "done")
 """Phases in which the robot stands because it was told to."""
 SAFETY_WORDS = {
@@ -78,6 +80,43 @@ def frontier_in_words(frontier: int, gain: float, distance_m: float, risk: float
 
 
 @dataclass(slots=True)
+class GivenUp:
+    """Tells which places are given up anew: noise makes frontiers come and go at one place every second or two."""
+
+    _until: list[tuple[float, float, str, int]] = field(default_factory=list)
+    """x, y, reason, and the time until which the place counts as told, ns."""
+
+    def fresh(self, coverage: CoverageSummary) -> list[tuple[float, float, str]]:
+        """(x, y, reason) of what is listed and was not, for the same reason within `_SAME_M`, in the last minutes."""
+        now, until = coverage.stamp_ns, coverage.stamp_ns + _TOLD_S * SECOND_NS
+        told = [place for place in self._until if place[3] > now]
+        found: list[tuple[float, float, str]] = []
+        for (x, y), reason in zip(
+            coverage.unreachable_xy_m.tolist(), coverage.unreachable_reason, strict=False
+        ):
+            near = [
+                k
+                for k, (a, b, r, _) in enumerate(told)
+                if r == reason and math.dist((x, y), (a, b)) < _SAME_M
+            ]
+            if not near:
+                found.append((x, y, reason))
+                told.append((x, y, reason, until))
+            for k in near:
+                told[k] = (*told[k][:3], until)
+        self._until = told
+        return found
+
+    def state(self) -> list[list[Any]]:
+        """For a snapshot."""
+        return [list(place) for place in self._until]
+
+    def set_state(self, state: list[list[Any]]) -> None:
+        """Go on from `state`; places of an older snapshot, without times, count as new."""
+        self._until = [(float(p[0]), float(p[1]), str(p[2]), int(p[3])) for p in state if len(p) == 4]
+
+
+@dataclass(slots=True)
 class EventLog:
     """The newest events. Fed with every message; says something when something changed."""
 
@@ -88,7 +127,7 @@ class EventLog:
     _phase: str = ""
     _safety: tuple[str, str] = ("", "")
     _fences: int = 0
-    _given_up: list[tuple[float, float, str]] = field(default_factory=list)
+    _given_up: GivenUp = field(default_factory=GivenUp)
     _health: dict[str, tuple[bool, int]] = field(default_factory=dict)
     _lost: bool = False
 
@@ -172,14 +211,10 @@ class EventLog:
         self.add(state.stamp_ns, "mission", text, before=before, finish=state.finish.value)
 
     def _coverage(self, coverage: CoverageSummary) -> None:
-        """Frontiers that were given up since the last summary, and those that came back."""
-        places = zip(coverage.unreachable_xy_m.tolist(), coverage.unreachable_reason, strict=False)
-        now = [(float(x), float(y), reason) for (x, y), reason in places]
-        for x, y, reason in now:
-            if not any(r == reason and math.dist((x, y), (a, b)) < _SAME_M for a, b, r in self._given_up):
-                text = f"gave up the frontier at ({x:.1f}, {y:.1f}): {reason}"
-                self.add(coverage.stamp_ns, "given_up", text, x_m=x, y_m=y, reason=reason)
-        self._given_up = now
+        """Frontiers that were given up lately."""
+        for x, y, reason in self._given_up.fresh(coverage):
+            text = f"gave up the frontier at ({x:.1f}, {y:.1f}): {reason}"
+            self.add(coverage.stamp_ns, "given_up", text, x_m=x, y_m=y, reason=reason)
 
     def _plan(self, plan: Plan) -> None:
         state = (plan.safety.value, plan.reason if plan.safety.value != "run" else "")
@@ -230,7 +265,7 @@ class EventLog:
             "phase": self._phase,
             "safety": list(self._safety),
             "fences": self._fences,
-            "given_up": [list(place) for place in self._given_up],
+            "given_up": self._given_up.state(),
             "lost": self._lost,
         }
 
@@ -241,4 +276,4 @@ class EventLog:
         self._target, self._phase = state["target"], state["phase"]
         self._safety = (state["safety"][0], state["safety"][1])
         self._fences, self._lost = state["fences"], state["lost"]
-        self._given_up = [(x, y, reason) for x, y, reason in state["given_up"]]
+        self._given_up.set_state(state["given_up"])

@@ -5,16 +5,18 @@ The coordinates are not longitudes and latitudes but x and y in `map` or `odom`,
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from planning.graph_mirror import FRONTIER, RoadMap
 from planning.polygons import PolygonError, check_rings
 from schemas.fences import MAX_FENCES, MAX_RINGS, MAX_VERTICES, MAX_WEIGHT, Fence, FenceFrame, FenceKind, Ring
-from services.status.problems import FieldError, ProblemError
+from services.status.problems import FieldError, ProblemError, finite
 
 _DEFAULT_WEIGHT = 3.0
 _Number = Annotated[float, Field(ge=-100_000, le=100_000, allow_inf_nan=False)]
@@ -206,54 +208,70 @@ def fences_geojson(version: int, fences: list[Fence]) -> FeatureCollectionOut:
     return FeatureCollectionOut(frame="of each feature", version=version, features=features)
 
 
-def graph_geojson(version: int, road_map: RoadMap) -> FeatureCollectionOut:
-    """The Global IRM in `map`: breadcrumbs and frontiers as points, edges as lines."""
-    features = [_node_feature(road_map, index) for index in range(road_map.node_id.size)]
-    features += [_edge_feature(road_map, row, slot) for row, slot in _edges(road_map)]
-    return FeatureCollectionOut(frame="map", version=version, features=features)
+def graph_json(version: int, road_map: RoadMap) -> bytes:
+    """The Global IRM in `map` as GeoJSON (`FeatureCollectionOut`): breadcrumbs and frontiers as points, edges as lines.
+
+    Written from plain values, as a graph may have 100,000 nodes; numbers that are not finite are null.
+    """
+    features = [*_node_features(road_map), *_edge_features(road_map)]
+    whole = {
+        "type": "FeatureCollection",
+        "frame": "map",
+        "units": "m",
+        "version": version,
+        "features": features,
+    }
+    return json.dumps(whole, separators=(",", ":"), allow_nan=False).encode()
 
 
 def _edges(road_map: RoadMap) -> Iterator[tuple[int, int]]:
     """(row, slot) of every edge once."""
     rows = np.repeat(np.arange(road_map.node_id.size), np.diff(road_map.indptr))
-    for slot in np.flatnonzero(rows < road_map.indices).tolist():
-        yield int(rows[slot]), slot
+    slots = np.flatnonzero(rows < road_map.indices)
+    return zip(rows[slots].tolist(), slots.tolist(), strict=True)
 
 
-def _node_feature(road_map: RoadMap, index: int) -> FeatureOut:
-    x, y, z = road_map.xyz_m[index].tolist()
-    is_frontier = bool(road_map.kind[index] == FRONTIER)
-    node = int(road_map.node_id[index])
-    return FeatureOut(
-        id=f"node-{node}",
-        geometry={"type": "Point", "coordinates": [x, y, z]},
-        properties={
-            "node": node,
-            "kind": "frontier" if is_frontier else "breadcrumb",
-            "gain": float(road_map.gain[index]),
-            "coverage": float(road_map.coverage[index]),
-        },
-    )
+def _plain(values: NDArray[Any]) -> list[Any]:
+    """A column as plain values, null where they are not finite."""
+    if np.isfinite(values).all():
+        plain: list[Any] = values.tolist()
+        return plain
+    return [finite(value) for value in values.tolist()]
 
 
-def _edge_feature(road_map: RoadMap, row: int, slot: int) -> FeatureOut:
-    other = int(road_map.indices[slot])
-    return FeatureOut(
-        geometry={
-            "type": "LineString",
-            "coordinates": [road_map.xyz_m[row].tolist(), road_map.xyz_m[other].tolist()],
-        },
-        properties={
-            "a": int(road_map.node_id[row]),
-            "b": int(road_map.node_id[other]),
-            "distance_m": float(road_map.distance_m[slot]),
-            "risk": float(road_map.risk[slot]),
-            "driven": bool(road_map.driven[slot]),
-        },
-    )
+def _node_features(road_map: RoadMap) -> Iterator[dict[str, Any]]:
+    columns = (_plain(c) for c in (road_map.node_id, road_map.xyz_m, road_map.gain, road_map.coverage))
+    kinds = (road_map.kind == FRONTIER).tolist()
+    for is_frontier, node, xyz, gain, coverage in zip(kinds, *columns, strict=True):
+        kind = "frontier" if is_frontier else "breadcrumb"
+        yield {
+            "type": "Feature",
+            "id": f"node-{node}",
+            "geometry": {"type": "Point", "coordinates": xyz},
+            "properties": {"node": node, "kind": kind, "gain": gain, "coverage": coverage},
+        }
 
 
-def graph_graphml(version: int, road_map: RoadMap) -> str:
+def _edge_features(road_map: RoadMap) -> Iterator[dict[str, Any]]:
+    node, xyz, other = _plain(road_map.node_id), _plain(road_map.xyz_m), road_map.indices.tolist()
+    distance_m, risk, driven = _plain(road_map.distance_m), _plain(road_map.risk), road_map.driven.tolist()
+    for row, slot in _edges(road_map):
+        end = other[slot]
+        yield {
+            "type": "Feature",
+            "id": None,
+            "geometry": {"type": "LineString", "coordinates": [xyz[row], xyz[end]]},
+            "properties": {
+                "a": node[row],
+                "b": node[end],
+                "distance_m": distance_m[slot],
+                "risk": risk[slot],
+                "driven": bool(driven[slot]),
+            },
+        }
+
+
+def graph_graphml(version: int, road_map: RoadMap) -> bytes:
     """The Global IRM as GraphML, as networkx and Gephi read it."""
     import networkx as nx
 
@@ -271,4 +289,4 @@ def graph_graphml(version: int, road_map: RoadMap) -> str:
             risk=float(road_map.risk[slot]),
             driven=bool(road_map.driven[slot]),
         )
-    return "\n".join(nx.generate_graphml(graph))
+    return "\n".join(nx.generate_graphml(graph)).encode()

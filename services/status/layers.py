@@ -11,7 +11,7 @@ from PIL import Image
 
 from planning.grid import FREE, LETHAL, GridSpec
 from schemas.world import RiskMap
-from services.status.picture import COLOURS
+from services.status.picture import COLOURS, coloured
 
 _FREE_PX, _WALL_PX, _UNKNOWN_PX = 254, 0, 205
 _OBSTACLE = 3
@@ -31,9 +31,8 @@ class Layer(NamedTuple):
 
 def coverage_layer(spec: GridSpec, cells: NDArray[np.uint8]) -> Layer:
     """From the canvas of the mission, in `map`: cells as in `schemas.world.CoverageWindow`."""
-    rgba = np.zeros((*spec.shape, 4), np.uint8)
-    rgba[..., :3] = COLOURS[np.minimum(cells, len(COLOURS) - 1)]
-    rgba[..., 3] = np.where(cells == 0, 0, 255)
+    clear = np.where(np.arange(len(COLOURS)) == 0, 0, 255).astype(np.uint8)
+    rgba = coloured(cells, np.column_stack((COLOURS, clear)))
     occupancy = np.full(spec.shape, _FREE_PX, np.uint8)
     occupancy[cells == 0] = _UNKNOWN_PX
     occupancy[cells == _OBSTACLE] = _WALL_PX

@@ -1,4 +1,4 @@
-"""The live page's files, served from the package: nothing is built, nothing comes from elsewhere."""
+"""The pages' files, served from the package: nothing is built, nothing comes from elsewhere."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 
 STATIC = Path(__file__).parent / "static"
+PAGES = {"/": "index.html", "/docs": "docs.html"}
+"""By path: the live page, and the interface to read and to try (Swagger UI over /openapi.json)."""
 _HEADERS = {
     "Cache-Control": "no-cache",
     "Content-Security-Policy": (
@@ -29,9 +31,13 @@ class _Files(StaticFiles):
 
 
 def add_page(app: FastAPI) -> None:
-    """Serve the page at `/` and its files under `/static`."""
+    """Serve the pages and their files under `/static`."""
     app.mount("/static", _Files(directory=STATIC), name="static")
+    for path, name in PAGES.items():
+        _add(app, path, STATIC / name)
 
-    @app.get("/", include_in_schema=False)
+
+def _add(app: FastAPI, path: str, file: Path) -> None:
+    @app.get(path, include_in_schema=False)
     def page() -> FileResponse:
-        return FileResponse(STATIC / "index.html", media_type="text/html", headers=_HEADERS)
+        return FileResponse(file, media_type="text/html", headers=_HEADERS)

@@ -1,7 +1,7 @@
 """A consumer that sleeps in every message, as a process: `python -m tests.faults.slow_consumer SECONDS TOPIC,...`.
 
-Prints one JSON object: `ages`: the oldest sample of each topic as it came in (s, by the mission clock), `heard`: how
-many came, `grown_mib`: resident memory at the end over that after the first third.
+Prints one JSON object: `ages`: the oldest sample of each topic as it came in (s, by the mission clock), `heard`: when
+each came (s, monotonic) and its sequence, `grown_mib`: resident memory at the end over that after the first third.
 """
 
 from __future__ import annotations
@@ -32,11 +32,16 @@ def main() -> None:
     config = load_config()
     clock = MissionClock.of(config.clock, config.runtime.state_dir)
     ages: dict[str, list[float]] = {name: [] for name in names}
+    heard: dict[str, list[tuple[float, int]]] = {name: [] for name in names}
 
     def slowly(topic: Topic[Message], payload: bytes) -> None:
-        came_ns = clock.now_ns()  # before it is decoded: that takes this process's time, not the sample's
+        came_s, came_ns = (
+            time.monotonic(),
+            clock.now_ns(),
+        )  # before it is decoded: that takes this process's time, not the sample's
         _, envelope = decode(payload, topic.message, topic.max_bytes)
         ages[topic.name].append((came_ns - envelope.sent_ns) / SECOND_NS)
+        heard[topic.name].append((came_s, envelope.sequence))
         time.sleep(_SLEEP_S)
 
     memory = psutil.Process()
@@ -47,7 +52,6 @@ def main() -> None:
         warm = memory.memory_info().rss
         time.sleep(seconds * 2 / 3)
         grown = memory.memory_info().rss - warm
-    heard = {name: len(found) for name, found in ages.items()}
     worst = {name: max(found, default=-1.0) for name, found in ages.items()}
     print(json.dumps({"ages": worst, "heard": heard, "grown_mib": grown / 2**20}))
 

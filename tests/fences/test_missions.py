@@ -67,6 +67,38 @@ def test_ground_behind_a_fence_that_is_removed_is_explored(tmp_path: Path) -> No
     assert run.seen.coverage > 0.95
 
 
+PARTING = {
+    "slam": {
+        "drift_fraction": 0.2,
+        "drift_yaw_deg_per_10m": 10.0,
+        "closure_min_path_m": 6.0,
+        "closure_radius_m": 3.0,
+        "closure_interval_m": 2.0,
+    }
+}
+"""A SLAM so poor that the two frames part by decimetres while the mission lasts."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("frame", list(FenceFrame))
+def test_a_no_go_polygon_is_obeyed_in_its_own_frame_while_the_frames_part(
+    tmp_path: Path, frame: FenceFrame
+) -> None:
+    """By what the robot believes: it cannot know better. Margin: 0.1 m, by which a closure may move what was passed."""
+    run = mission(tmp_path, {4.0: draw("a", FenceKind.NO_GO, *EAST, frame=frame)}, sim=PARTING)
+    end = run.to_its_end()
+    seen = run.seen
+    assert [answer.accepted for answer in seen.answers] == [True]
+    assert seen.drift_m() > 0.3, "the frames did not part: the test would show nothing"
+    poses = seen.in_odom if frame == FenceFrame.ODOM else seen.in_map
+    x0, y0, x1, y1 = EAST
+    inside = [(t, x, y) for t, x, y in poses if t >= 5.0 and x0 + 0.1 < x < x1 and y0 < y < y1]
+    assert inside == []
+    assert end.finish == FinishReason.COVERED
+    assert seen.inside(*NORTH) > 0
+
+
 def _first_room(seen: Seen) -> str:
     for _, x, y in seen.track:
         if x > 8.5:

@@ -211,7 +211,8 @@ def test_without_anything_to_do_it_says_so() -> None:
 
 
 def test_covering_begins_and_ends_at_different_thresholds() -> None:
-    config = FAST.model_copy(update={"cover_begin_entropy": 0.6, "cover_end_entropy": 0.2})
+    thresholds = {"cover_begin_entropy": 0.6, "cover_end_entropy": 0.2, "cover_min_value": 0.0}
+    config = FAST.model_copy(update=thresholds)
     rich, middle, poor = (corridor({5: nats}) for nats in (0.65, 0.4, 0.15))
     feed = Feed("lcp", create(config, StageSetup("robot", 1)))
     far: GlobalPolicy = global_policy([at(2), at(30)])
@@ -283,7 +284,7 @@ def test_on_the_way_back_nothing_is_covered() -> None:
 
 def test_the_value_of_the_leaf_draws_the_policy_to_where_the_mission_goes_on() -> None:
     """The same little ground on both sides: what is worth more afterwards decides which comes last."""
-    lattice = corridor({1: 0.4, 7: 0.4})
+    lattice = corridor({1: 0.69, 7: 0.69})
     ends = []
     for column in (0, 8):
         feed = feed_of(lattice)
@@ -397,7 +398,8 @@ def test_an_answer_does_not_depend_on_the_episodes_before_it() -> None:
 
 
 def test_it_goes_on_from_a_snapshot() -> None:
-    config = FAST.model_copy(update={"cover_begin_entropy": 0.6, "cover_end_entropy": 0.2})
+    thresholds = {"cover_begin_entropy": 0.6, "cover_end_entropy": 0.2, "cover_min_value": 0.0}
+    config = FAST.model_copy(update=thresholds)
     first = Feed("lcp", create(config, StageSetup("robot", 1)))
     poor, middle = corridor({5: 0.1}), corridor({5: 0.4})
     first.put(LOCAL_IRM, local_irm(poor), 0)

@@ -170,6 +170,26 @@ def test_a_base_that_lives_but_does_not_answer_loses_the_lease() -> None:
     assert world.arbiter.lease.holder == STANDBY
 
 
+def test_what_has_aged_by_the_hand_back_is_not_passed_on_with_it() -> None:
+    """Its only policy was in order when it came; when the base is obeyed, the robot has known better for long."""
+    world = _World()
+    for _ in range(5):
+        world.second(base=False)
+    old = world.version - 2
+    world.says(BASE, GLOBAL_POLICY, global_policy(0, old), (old, old))
+    assert world.arbiter.dropped == {}
+    for _ in range(4):
+        world.robot()
+        world.says(BASE, HEALTH, _health(0))
+        world.says(STANDBY, HEALTH, _health(0))
+        world.now_ms += 500
+        world.hand_on(world.arbiter.tick(world.now_ms * MS, 0))
+    assert world.arbiter.lease.holder == BASE
+    assert old not in {version for version, at_ms in world.passed if at_ms > 5000}
+    world.says(BASE, GLOBAL_POLICY, global_policy(0, world.version))
+    assert world.passed[-1][0] == world.version
+
+
 def test_an_instance_that_is_not_ready_gets_nothing() -> None:
     world = _World()
     for _ in range(10):

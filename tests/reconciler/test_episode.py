@@ -231,11 +231,11 @@ def test_the_model_is_the_shared_one() -> None:
 def test_the_model_counts_ground_left_behind_as_lcp_does() -> None:
     lattice = random_lattice(3, SIZE, 2, wall_share=0.2, covered_share=0.5)
     irm = local_irm(lattice)
-    found = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), CONFIG).entropy
+    weights = RewardWeights(leftover_weight=3.0, leftover_gain=0.3)
+    found = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), Config(weights=weights)).entropy
     reached = reachable_entropy(irm.entropy, irm.visible, irm.edge_distance_m, irm.size, irm.reach)
-    expected = leftover_entropy(reached, irm.state == 1, irm.size, CONFIG.weights)
+    expected = leftover_entropy(reached, irm.state == 1, irm.size, weights)
     np.testing.assert_allclose(found, by_tile(expected, irm.size))
-    weights = RewardWeights(leftover_weight=0.0, leftover_gain=0.0)
-    paper = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), Config(weights=weights)).entropy
+    paper = model_here(irm, 24, 1, np.zeros(SIZE, np.uint64), CONFIG).entropy
     np.testing.assert_allclose(paper, by_tile(reached, irm.size))
     assert (found > paper).any()

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from plgrim.evaluation.recorder import TRAJECTORY_COLUMNS
-from plgrim.report.frames import FrameMaker
+from plgrim.report.frames import LEGEND_PX, FrameMaker
 from plgrim.report.gather import ReportError
 from plgrim.report.page import write_report
 from schemas.base import Pose
@@ -112,7 +112,7 @@ def test_frames_show_the_drive_and_become_an_animation(tmp_path: Path) -> None:
         message = odometry(t * SECOND_NS, 3.0 * t).model_copy(update={"map_to_odom": Pose(y_m=2.0)})
         maker.observe(message, t * SECOND_NS)
     assert len(maker.frames) == 10
-    assert maker.frames[0].size == (200, 100)
+    assert maker.frames[0].size == (200, 100 + LEGEND_PX)
     first, last = (np.asarray(maker.frames[i]).astype(int) for i in (0, -1))
     rows, columns = np.nonzero(np.abs(first - last).sum(axis=2)[30:] > 100)
     assert columns.max() > 120  # the robot is at 27 of 40 m by now

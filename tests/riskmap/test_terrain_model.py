@@ -218,6 +218,30 @@ def test_ground_once_seen_is_not_taken_for_overhead_when_what_leads_there_is_mis
     assert at(model, layers_of(model, Pose()).state, 8.05, 0.1) == FREE
 
 
+def test_supposed_ground_is_no_ceiling_of_itself_either() -> None:
+    """The far part of a ramp is seen before what leads there; then all but a strip of it, which is supposed between. A
+    thing that hangs over the strip stays."""
+    y = np.arange(-0.5, 0.5, 0.01)
+
+    def ramp(*xs: float, over_m: float = 0.0) -> NDArray[np.float64]:
+        return np.concatenate(
+            [np.stack([0.0 * y + x, y, 0.0 * y + max(0.0, 0.4 * (x - 4.0)) + over_m], axis=1) for x in xs]
+        )
+
+    around = [*np.arange(2.0, 7.95, 0.05), *np.arange(8.2, 9.0, 0.05)]
+    for over_m, what in ((0.0, FREE), (0.5, LETHAL)):
+        model = TerrainModel(config(profile="spot"))
+        model.integrate(sparse_cloud(ramp(3.0, 3.9, 8.05, over_m=over_m), 1))
+        assert at(model, cells_of(model)[CEILING_SEEN], 8.05, 0.05) > 0, "taken for something overhead at first"
+        for k in range(3):
+            model.integrate(sparse_cloud(ramp(*around), k + 2))
+        assert at(model, cells_of(model)[SEEN], 8.05, 0.05) == 0, "supposed"
+        assert at(model, cells_of(model)[VARIANCE], 8.05, 0.05) > 0
+        assert int(at(model, layers_of(model, Pose()).state, 8.05, 0.05)) == what
+        model.integrate(sparse_cloud(ramp(3.0, 3.9, 8.05), 9))
+        assert int(at(model, layers_of(model, Pose()).state, 8.05, 0.05)) == what, "seen once more from afar"
+
+
 @pytest.mark.parametrize("in_one_sweep", [True, False])
 def test_a_roof_below_which_a_ray_has_passed_is_not_taken_for_ground_that_rises(in_one_sweep: bool) -> None:
     """The roof of a neck, 1.3 m over its floor, is the first that a level ray meets after a gap between the rings."""

@@ -11,7 +11,7 @@ import pytest
 from plgrim.deployment import ROLES, Role, processes_of
 from plgrim.security.access import ROUTER, certificate_name
 from plgrim.security.certificates import Authority
-from schemas.topics import LINK
+from plgrim.security.policy import FROM_ROBOT
 from tests.runtime.helpers import REPOSITORY
 
 ROBOT = "husky1"
@@ -32,13 +32,14 @@ def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
 
 @pytest.fixture(scope="session")
 def certificates_by_role(authority: Authority, tmp_path_factory: pytest.TempPathFactory) -> dict[Role, Path]:
-    """A folder for each kind of host; the routers are known as 127.0.0.1. The link has one certificate for both."""
+    """A folder for each kind of host; the routers are known as 127.0.0.1; the robot's link has one for both."""
     folders = {role: tmp_path_factory.mktemp(f"certs-{role}") for role in ROLES}
     for role, folder in folders.items():
         for process in processes_of(role):
             hosts = ("127.0.0.1",) if process == ROUTER else ()
             authority.issue(certificate_name(process, role, ROBOT), folder / process, hosts)
-    shutil.copytree(folders["robot"] / LINK, folders["base"] / LINK)
+    for known_as, process in FROM_ROBOT.items():
+        shutil.copytree(folders["robot"] / process, folders["base"] / known_as)
     for folder in folders.values():
         authority.trust(folder)
     return folders

@@ -17,7 +17,14 @@ from plgrim.deployment import ROLES, Role
 from plgrim.errors import NoRouterError
 from plgrim.runtime.router import router_settings
 from plgrim.runtime.zenoh_session import Link, connect
-from plgrim.security.access import OPERATOR, TOOLS, every_topic
+from plgrim.security.access import (
+    OPERATOR,
+    RECORDER,
+    ROBOT_RECORDER,
+    SEGMENTS_QUERY,
+    TOOLS,
+    every_topic,
+)
 from plgrim.security.certificates import Authority
 from plgrim.security.policy import clients_of, router_grants
 from schemas.base import Message
@@ -33,7 +40,7 @@ Heard = list[tuple[str, bytes]]
 
 AT_BASE = ("gcp", "status")
 """The usual split, of which gcp has a standby on the robot."""
-QUIET = (TOOLS, OPERATOR)
+QUIET = (TOOLS, OPERATOR, RECORDER, ROBOT_RECORDER)
 """They write no topic."""
 INSTANCE: dict[Role, str] = {"all": "", "robot": "standby", "base": "base"}
 
@@ -203,6 +210,23 @@ def test_the_link_reads_what_crosses(certificates_by_role: dict[Role, Path]) -> 
         reads = {key.removeprefix(f"{root_of(ROBOT)}/") for key in router_grants(config)[LINK].reads}
         assert wanted <= reads
         assert not reads & {"sim/cloud", "sim/world_picture", "riskmap/moving", "mission/graph_request"}
+
+
+def test_the_robots_recorder_hands_out_its_segments_at_the_base_and_no_more(
+    certificates_by_role: dict[Role, Path],
+) -> None:
+    segments, ears = f"{root_of(ROBOT)}/{SEGMENTS_QUERY}", []  # type: tuple[str, Heard]
+    with host("base", certificates_by_role["base"]) as here:
+        robots, base = here.links[ROBOT_RECORDER], here.links[RECORDER]
+        base.answer(segments, lambda: b"not the robot's")
+        eventually(lambda: here.links[TOOLS].ask(segments, 1.0) == b"not the robot's", "the base may, too")
+        assert here.links["gcp"].ask(segments, 1.0) is None
+        base._keep.clear()
+        robots.answer(segments, lambda: b"the robot's")
+        eventually(lambda: here.links[TOOLS].ask(segments, 1.0) == b"the robot's", "they are handed out")
+        _listen(robots, f"{root_of(ROBOT)}/**", ears)
+        here.last_words()
+        assert ears == []
 
 
 def test_nobody_answers_or_lives_for_another(links: dict[str, Link]) -> None:

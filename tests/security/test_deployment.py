@@ -12,6 +12,7 @@ import yaml
 from plgrim.config import Config, environment_overrides, load_config
 from plgrim.deployment import Role, services_of, started_by_up
 from plgrim.errors import ConfigError
+from plgrim.security.access import RECORDER
 from schemas.hosts import is_loopback
 from schemas.topics import LINK, SERVICES
 
@@ -21,7 +22,7 @@ COMPOSE: dict[Role, Path] = {
     "robot": ROOT / "deploy" / "robot.yml",
     "base": ROOT / "deploy" / "base.yml",
 }
-_BESIDE = {"all": {"router", "explore"}, "robot": {"router", LINK}, "base": {"router"}}
+_BESIDE = {"all": {"router", "explore"}, "robot": {"router", LINK}, "base": {"router", RECORDER}}
 
 
 def composed(role: Role) -> dict[str, dict[str, Any]]:
@@ -55,7 +56,7 @@ def test_each_container_has_its_own_certificate_read_only(role: Role) -> None:
 def test_whatever_has_an_epoch_keeps_it(role: Role) -> None:
     """Without the volume a link that restarts with a clock set back is refused by all who heard its last life."""
     for name, service in composed(role).items():
-        assert name == "router" or "state:/var/lib/plgrim" in service["volumes"], name
+        assert name in ("router", RECORDER) or "state:/var/lib/plgrim" in service["volumes"], name
 
 
 @pytest.mark.parametrize("role", ["all", "robot", "base"])
@@ -66,6 +67,16 @@ def test_health_checks_ask_about_the_service_of_their_container(role: Role) -> N
     for name, check in checks.items():
         if name not in ("router", "explore"):
             assert check == ["CMD", "plgrim", "healthcheck", name]
+
+
+def test_the_base_records_onto_a_volume_that_does_not_grow_for_ever() -> None:
+    recorder = composed("base")[RECORDER]
+    assert default(recorder["command"]) == "record --out /recordings --max-mb 4000"
+    assert "recordings:/recordings" in [default(mount) for mount in recorder["volumes"]]
+    image = (ROOT / "deploy" / "Dockerfile").read_text(encoding="utf-8")
+    assert re.search(r"install -d -o plgrim -g plgrim .*/recordings\b", image), (
+        "a volume has its folder's owner"
+    )
 
 
 def test_a_router_that_dies_does_not_end_the_services() -> None:
@@ -105,7 +116,7 @@ def test_systemd_targets_want_the_services_of_their_role(role: Role) -> None:
     assert wanted is not None
     units = {unit for unit in wanted[1].split() if unit.startswith("plgrim@")}
     assert units == {f"plgrim@{name}.service" for name in services_of(role, simulated=False)}
-    beside = {"plgrim-router.service"} | ({"plgrim-link.service"} if role == "robot" else set())
+    beside = {"plgrim-router.service", f"plgrim-{'link' if role == 'robot' else 'recorder'}.service"}
     assert set(wanted[1].split()) - units == beside
 
 

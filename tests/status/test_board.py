@@ -8,6 +8,8 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from planning.graph_mirror import GraphMirror
 from services.status.app import LiveStatus, SharedStatus
@@ -143,3 +145,39 @@ def test_the_old_path_is_the_one_before_the_policy_changed() -> None:
         scene.shared.observe("reconciler/plan", plan(n))
     view = scene.shared.read(lambda core, now_ns: core.view(now_ns, 0, False))
     assert view.old_path[0] == pytest.approx((plan(48).x_m[0], plan(48).y_m[0]))
+
+
+def _take(shown: dict[str, Any], frame: dict[str, Any]) -> dict[str, Any]:
+    """What the page does with a frame (`store.js`)."""
+    kept = {} if frame["full"] else shown
+    return {key: value for key, value in (kept | frame["parts"]).items() if value is not None}
+
+
+@given(st.lists(st.tuples(st.integers(0, 11), st.sampled_from(["put", "drop", "look"])), max_size=120))
+def test_a_browser_that_looks_now_and_then_shows_what_is_there_whatever_was_forgotten(
+    steps: list[tuple[int, str]],
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("services.status.board._KEPT_GONE", 3)
+        board, there, shown, version = Board(), dict[str, Any](), dict[str, Any](), 0
+        for n, (part, what) in enumerate([*steps, (0, "look")]):
+            if what == "put":
+                there[f"p:{part}"] = n
+                board.put(f"p:{part}", n)
+            elif what == "drop":
+                there.pop(f"p:{part}", None)
+                board.keep_only("p:", set(there))
+            else:
+                frame = read(board.frame(version))
+                shown, version = _take(shown, frame), frame["version"]
+                assert shown == there
+
+
+def test_parts_that_come_and_go_leave_nothing_behind() -> None:
+    board = Board()
+    for n in range(5000):
+        board.put(f"events:{n}", n)
+        board.keep_only("events:", {f"events:{n}"})
+    assert len(board._parts) < 300
+    assert read(board.frame(1))["full"]
+    assert not read(board.frame(board.version - 10))["full"]

@@ -39,8 +39,6 @@ _OPEN = {
     "/",
     "/openapi.json",
     "/docs",
-    "/docs/oauth2-redirect",
-    "/redoc",
 }
 """What tells nothing of the robot, or only that it is ready; and the page, which holds no data of its own."""
 REQUESTS = 10_000

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
-from schemas.fences import Fence, Fences
+from planning.frames import planar
+from schemas.base import Pose
+from schemas.fences import Fence, FenceFrame, FenceKind, Fences, Ring
 from schemas.operation import CommandAnswer, CommandKind, MissionCommand, MissionPhase
 from services.status.app import SharedStatus, StatusServer
 from services.status.config import Config
@@ -321,6 +323,66 @@ def test_a_polygon_is_drawn_sent_shown_and_removed(open_page: Callable[..., Any]
     assert page.evaluate("plgrim.map.fences.length") == 1
     page.click(".fences button")
     until(page, "document.querySelectorAll('.fences li').length === 0")
+
+
+def _sides_drawn(page: Any, corners: list[tuple[float, float]], colour: str) -> int:
+    """On how many sides of a polygon, places in `map`, the middle is drawn in a colour, within a pixel."""
+    sides = zip(corners, [*corners[1:], corners[0]], strict=True)
+    middles = [[(a[0] + b[0]) / 2, (a[1] + b[1]) / 2] for a, b in sides]
+    count: int = page.evaluate(
+        """([places, name]) => {
+          const map = plgrim.map;
+          map.follow = false;
+          map.shown = { fences: true };
+          [map.cx, map.cy, map.scale] = [5, 0, 12];
+          map.draw();
+          const copy = document.createElement("canvas");
+          Object.assign(copy, { width: map.canvas.width, height: map.canvas.height });
+          const context = copy.getContext("2d", { willReadFrequently: true });
+          context.drawImage(map.canvas, 0, 0);
+          const hex = map.colours[name].replace("#", "");
+          const wanted = [0, 2, 4].map((i) => parseInt(hex.slice(i, i + 2), 16));
+          const here = ([x, y]) => {
+            const data = context.getImageData(Math.floor(x) - 1, Math.floor(y) - 1, 3, 3).data;
+            for (let i = 0; i < data.length; i += 4) if (wanted.every((v, k) => data[i + k] === v)) return true;
+            return false;
+          };
+          return places.map(([x, y]) => map.screen(x, y).map((at) => at * map.ratio)).filter(here).length;
+        }""",
+        [middles, colour],
+    )
+    return count
+
+
+def _placed(frame: Pose, corners: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The corners, of `odom`, in `map`."""
+    return [planar(frame).apply(x, y) for x, y in corners]
+
+
+@pytest.mark.parametrize("kind", [FenceKind.GEOFENCE, FenceKind.NO_GO])
+def test_polygons_are_drawn_where_they_lie_in_their_own_frame_also_after_a_loop_closure(
+    open_page: Callable[..., Any], robot: Robot, kind: FenceKind
+) -> None:
+    corners = [(2.0, 1.0), (9.0, 1.0), (9.0, 7.0), (2.0, 7.0)]
+    ring = Ring.of([*corners, corners[0]])
+    page = open_page(quiet=False)
+    until(page, MAP_SHOWN)
+    robot.moving = False
+    page.wait_for_timeout(300)
+    colour = "geofence" if kind == FenceKind.GEOFENCE else "noGo"
+    for version, frame in enumerate(FenceFrame):
+        drawn = Fence(fence_id="one", kind=kind, frame=frame, rings=[ring])
+        robot.shared.observe("mission/fences", Fences(stamp_ns=1, version=version + 1, fences=[drawn]))
+        until(page, f"plgrim.map.fences[0]?.frame === '{frame.value}'")
+        for map_to_odom in (Pose(x_m=4.0, y_m=-9.0, yaw_rad=0.7), Pose(x_m=-3.0, y_m=2.0, yaw_rad=-0.4)):
+            moved = odometry(robot.scene.n).model_copy(update={"map_to_odom": map_to_odom})
+            robot.shared.observe("sim/odometry", moved)
+            until(page, f"Math.abs(plgrim.store.get('pose').frame[2] - {map_to_odom.yaw_rad}) < 1e-6")
+            here = corners if frame == FenceFrame.MAP else _placed(map_to_odom, corners)
+            elsewhere = corners if frame == FenceFrame.ODOM else _placed(map_to_odom, corners)
+            least = 4 if kind == FenceKind.GEOFENCE else 1  # a dashed line has gaps
+            assert _sides_drawn(page, here, colour) >= least, f"{frame}: not where it lies"
+            assert _sides_drawn(page, elsewhere, colour) <= 1, f"{frame}: as if it lay in the other frame"
 
 
 def test_a_polygon_can_be_drawn_with_the_keyboard_alone(open_page: Callable[..., Any], robot: Robot) -> None:
