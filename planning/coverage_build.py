@@ -6,25 +6,39 @@ The model itself is `planning.coverage_model`.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.bits import count_bits
-from planning.coverage_model import MAX_EDGE_RISK, CoverageModel
+from planning.coverage_groups import clusters
+from planning.coverage_model import MAX_EDGE_RISK, CoverageModel, move_cost
+from planning.coverage_tiles import (
+    TileLists,
+    by_tile,
+    count_fresh,
+    empty_lists,
+    fill_differences,
+    fill_footprints,
+    tile_count,
+    tiles_of_rows,
+    trimmed,
+)
 from planning.grid import DIRECTION_DX, DIRECTION_DY
 from planning.kernels import njit
-from planning.lattice_graph import seen_by_any, travel_costs
+from planning.lattice_graph import seen_by_any
 from planning.reward import RewardParameters
 
-_MAX_CLUSTERS = 400
-_ONE = np.uint64(1)
 _FULL_TURN = 2.0 * math.pi - 1e-6
 
 
+@lru_cache(maxsize=8)
 def wedge_rows(reach: int, fov_rad: float) -> NDArray[np.uint32]:
-    """(8, 2 reach + 1) words: offsets inside the field of view for each heading; the own node always."""
+    """(8, 2 reach + 1) words: offsets inside the field of view for each heading; the own node always.
+
+    One array for all who ask: not to be changed.
+    """
     rows = np.zeros((8, 2 * reach + 1), np.uint32)
     for k in range(8):
         heading = k * math.pi / 4.0
@@ -38,194 +52,84 @@ def wedge_rows(reach: int, fov_rad: float) -> NDArray[np.uint32]:
 
 
 @njit
-def best_viewpoint(
-    visible: NDArray[np.uint32],
-    cost: NDArray[np.float64],
-    size: int,
-    reach: int,
-    top: int,
-    words: NDArray[np.uint64],
-    middle_row: float,
-    middle_column: float,
-) -> int:
-    """The reachable node near a block that sees most of it, then the nearest to its middle; -1 if none sees any.
-
-    cost: (n,) travel from the root, inf where the robot cannot go. words: (3,) the block's nodes, from row `top`.
-    """
-    best, best_score = -1, 0.0
-    for row in range(max(0, top - reach), min(size, top + 3 + reach)):
-        for column in range(
-            max(0, int(middle_column) - 2 - reach), min(size, int(middle_column) + 3 + reach)
-        ):
-            node = row * size + column
-            if not math.isfinite(cost[node]):
-                continue
-            count = 0
-            for r in range(3):
-                offset = top + r - row + reach
-                if offset < 0 or offset > 2 * reach or top + r >= size:
-                    continue
-                shift = column - reach
-                word = np.uint64(visible[node, offset])
-                word = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
-                count += count_bits(word & words[r])
-            if count == 0:
-                continue
-            score = count - 0.3 * math.hypot(row - middle_row, column - middle_column) + 100.0
-            if score > best_score:
-                best, best_score = node, score
-    return best
-
-
-@njit
-def _see_block(
-    visible: NDArray[np.uint32],
-    node: int,
-    size: int,
-    reach: int,
-    top: int,
-    words: NDArray[np.uint64],
-    seen: NDArray[np.uint64],
-) -> None:
-    """Move the nodes of a block that a node sees (whatever its heading) from `words` to `seen`, (3,) each."""
-    shift = node % size - reach
-    for r in range(3):
-        seen[r] = np.uint64(0)
-        offset = top + r - node // size + reach
-        if 0 <= offset <= 2 * reach and top + r < size:
-            word = np.uint64(visible[node, offset])
-            word = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
-            seen[r] = word & words[r]
-            words[r] &= ~seen[r]
-
-
-@njit
-def _clusters(
-    grid: NDArray[np.bool_],
-    reach: int,
-    visible: NDArray[np.uint32],
+def _rank_moves(
+    lists: TileLists,
+    headings: int,
+    unlooked: NDArray[np.bool_],
     edge_distance_m: NDArray[np.float32],
     edge_risk: NDArray[np.float32],
-    risk_weight_m: float,
-    root: int,
-    moves: NDArray[np.int8],
-    costs: NDArray[np.float32],
-    rows: NDArray[np.uint64],
-    tops: NDArray[np.int32],
-) -> int:
-    size = grid.shape[0]
-    n = size * size
-    root_cost, cost, move = np.empty(n), np.empty(n), np.empty(n, np.int8)
-    words, seen = np.zeros(3, np.uint64), np.zeros(3, np.uint64)
-    travel_costs(root, size, edge_distance_m, edge_risk, risk_weight_m, MAX_EDGE_RISK, root_cost, move)
-    count = 0
-    for top in range(0, size, 3):
-        for left in range(0, size, 3):
-            total, middle_row, middle_column = 0, 0.0, 0.0
-            for r in range(3):
-                words[r] = np.uint64(0)
-                for c in range(left, min(left + 3, size)):
-                    if top + r < size and grid[top + r, c]:
-                        words[r] |= _ONE << np.uint64(c)
-                        total += 1
-                        middle_row += top + r
-                        middle_column += c
-            while total > 0 and count < tops.shape[0] and (words[0] | words[1] | words[2]) != np.uint64(0):
-                source = best_viewpoint(
-                    visible, root_cost, size, reach, top, words, middle_row / total, middle_column / total
-                )
-                if source < 0:
-                    break
-                _see_block(visible, source, size, reach, top, words, seen)
-                travel_costs(
-                    source, size, edge_distance_m, edge_risk, risk_weight_m, MAX_EDGE_RISK, cost, move
-                )
-                for i in range(n):
-                    moves[i, count], costs[i, count] = move[i], cost[i]
-                rows[count], tops[count] = seen, top
-                count += 1
-    return count
-
-
-def clusters(
-    entropy: NDArray[np.float64],
-    size: int,
-    reach: int,
-    visible: NDArray[np.uint32],
-    edge_distance_m: NDArray[np.float32],
-    edge_risk: NDArray[np.float32],
-    risk_weight_m: float,
-    root: int,
-) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.uint64], NDArray[np.int32]]:
-    """Groups of uncovered nodes (blocks of 3 x 3) and the way to each from every node, for the informed rule.
-
-    Behind a corner one viewpoint may not see the whole block: what it does not see is a group of its own, else the
-    rule would come back to this place for ever. Returns moves (n, c), costs (n, c), rows (c, 3), tops (c,).
-    """
-    n = size * size
-    moves, costs = np.full((n, _MAX_CLUSTERS), -1, np.int8), np.full((n, _MAX_CLUSTERS), np.inf, np.float32)
-    rows, tops = np.zeros((_MAX_CLUSTERS, 3), np.uint64), np.zeros(_MAX_CLUSTERS, np.int32)
-    grid = entropy.reshape(size, size) > 0.0
-    count = _clusters(
-        grid, reach, visible, edge_distance_m, edge_risk, risk_weight_m, root, moves, costs, rows, tops
-    )
-    return moves[:, :count].copy(), costs[:, :count].copy(), rows[:count].copy(), tops[:count].copy()
-
-
-@njit
-def _footprints(
-    visible: NDArray[np.uint32],
-    wedge: NDArray[np.uint32],
-    covered: NDArray[np.uint64],
-    reach: int,
-    footprint: NDArray[np.uint64],
-    low: NDArray[np.int8],
-    high: NDArray[np.int8],
-) -> None:
-    """What is visible, in the field of view and not covered, by node and heading: columns `CoverageModel` has, out.
-
-    Most rows around a robot that has looked about are empty: that they are skipped is half of the speed.
-    """
-    size = covered.shape[0]
-    for node in range(size * size):
-        shift = node % size - reach
-        for k in range(8):
-            low[node, k] = high[node, k] = 0
-            for r in range(2 * reach + 1):
-                row = node // size - reach + r
-                word = np.uint64(visible[node, r] & wedge[k, r])
-                word = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
-                word = word & ~covered[row] if 0 <= row < size else np.uint64(0)
-                footprint[node, k, r] = word
-                if word != np.uint64(0):
-                    low[node, k] = r if high[node, k] == 0 else low[node, k]
-                    high[node, k] = r + 1
-
-
-@njit
-def _fresh_most(
-    footprint: NDArray[np.uint64],
-    row_low: NDArray[np.int8],
-    row_high: NDArray[np.int8],
-    top: NDArray[np.int32],
     step_to: NDArray[np.int32],
-    fresh: NDArray[np.int16],
+    k_risk: float,
+    order: NDArray[np.int32],
+    most: NDArray[np.float32],
 ) -> None:
-    """(n, h, 8), out: how many nodes are seen from the end of a step that are not from its start, by the heading there.
+    """The moves from each node under each heading by the most that each can score, columns `CoverageModel` has, out.
 
-    h = 1: the sensor looks all around.
+    lists: the footprints, set node h + heading. The score is that of `coverage_model.best_gain_direction`, for all that
+    the sensor sees from the end of the move and not from its start.
     """
-    n, rows, headings = footprint.shape[0], footprint.shape[2], fresh.shape[1]
-    for node in range(n):
-        for k in range(8):
-            other = step_to[node, k]
-            if other < 0:
-                continue
-            for r in range(row_low[other, k], row_high[other, k]):
-                own = top[other] + r - top[node]
-                for h in range(headings):
-                    seen = footprint[node, h, own] if 0 <= own < rows else np.uint64(0)
-                    fresh[node, h, k] += count_bits(footprint[other, k, r] & ~seen)
+    seen, score, fresh = np.zeros(256, np.uint64), np.zeros(8), np.zeros(8, np.int64)
+    for node in range(step_to.shape[0]):
+        for heading in range(8):
+            if heading < headings:
+                _count_steps(
+                    lists, node, heading, headings, unlooked[node], edge_distance_m, step_to, seen, fresh
+                )
+            for k in range(8):
+                distance, risk = edge_distance_m[node, k], edge_risk[node, k]
+                score[k] = 0.0
+                if distance > 0.0 and risk <= MAX_EDGE_RISK:
+                    score[k] = 0.5 * fresh[k] / move_cost(distance, heading, k) - k_risk * risk
+            order[node, heading] = _sort_moves(score, most[node, heading])
+
+
+@njit
+def _count_steps(
+    lists: TileLists,
+    node: int,
+    heading: int,
+    headings: int,
+    unlooked: bool,
+    edge_distance_m: NDArray[np.float32],
+    step_to: NDArray[np.int32],
+    seen: NDArray[np.uint64],
+    fresh: NDArray[np.int64],
+) -> None:
+    """How many nodes the end of each step shows that its start under this heading does not, (8,) out.
+
+    seen: scratch, 0 in every tile before and after.
+    """
+    own = node * headings + heading
+    first, last = lists.start[own], lists.start[own + 1]
+    for e in range(first, last):
+        seen[lists.tile[e]] = np.uint64(0) if unlooked else lists.word[e]
+    for k in range(8):
+        if edge_distance_m[node, k] > 0.0:
+            fresh[k] = count_fresh(lists, step_to[node, k] * headings + (k if headings > 1 else 0), seen)
+    for e in range(first, last):
+        seen[lists.tile[e]] = np.uint64(0)
+
+
+@njit
+def _sort_moves(score: NDArray[np.float64], most: NDArray[np.float32]) -> int:
+    """The directions by falling score, 3 bits each; most: (8,) out, the scores in that order, 0 for none.
+
+    They are raised a little, as a float32 rounds: they bound what is computed in float64.
+    """
+    packed, count = np.int64(0), 0
+    for k in range(8):
+        if score[k] <= 0.0:
+            continue
+        raised, at = np.float32(score[k] * 1.000001), 0
+        while at < count and most[at] >= raised:
+            at += 1
+        for i in range(count, at, -1):
+            most[i] = most[i - 1]
+        most[at] = raised
+        below = packed & ((np.int64(1) << (3 * at)) - 1)
+        packed = ((packed - below) << 3) | (np.int64(k) << (3 * at)) | below
+        count += 1
+    return packed  # type: ignore[return-value]  # the compiler's int
 
 
 def lattice_steps(size: int) -> NDArray[np.int32]:
@@ -279,25 +183,55 @@ def build_model(
     risk_weight_m = weights.k_risk / max(weights.k_distance_per_m, 1e-3)
     # Copies: arrays of a decoded message are read-only, which is another type to the compiler and a second compilation.
     distance, risk, seen = np.array(edge_distance_m), np.array(edge_risk), np.array(visible)
-    move, cost, rows, top = clusters(entropy, size, reach, seen, distance, risk, risk_weight_m, start)
-    step_to, top_row = (
-        lattice_steps(size),
-        (np.arange(size * size, dtype=np.int32) // size - reach).astype(np.int32),
-    )
-    footprint = np.zeros((size * size, 8, 2 * reach + 1), np.uint64)
-    low, high = np.zeros((size * size, 8), np.int8), np.zeros((size * size, 8), np.int8)
-    covered = np.array(root.covered)
-    _footprints(seen, wedge_rows(reach, fov_rad), covered, reach, footprint, low, high)
-    unlooked, fresh = (
-        np.zeros(size * size, np.bool_),
-        np.zeros((size * size, 1 if fov_rad >= _FULL_TURN else 8, 8), np.int16),
-    )
-    unlooked[root.node[high[root.node, root.heading] > 0]] = True
-    _fresh_most(footprint, low, high, top_row, step_to, fresh)
+    groups = clusters(entropy, size, reach, seen, distance, risk, risk_weight_m, start)
+    step_to, tile_entropy = lattice_steps(size), by_tile(entropy, size)
+    n, headings = size * size, 1 if fov_rad >= _FULL_TURN else 8
+    free = ~np.array(root.covered) & np.uint64((1 << size) - 1)
+    whole = _room(n * headings, reach, size)
+    fill_footprints(seen, wedge_rows(reach, fov_rad)[:headings], free, tile_entropy, 0, whole)
+    own = root.node.astype(np.int64) * headings + (root.heading.astype(np.int64) if headings > 1 else 0)
+    unlooked = np.zeros(n, np.bool_)
+    unlooked[root.node[whole.start[own] < whole.start[own + 1]]] = True
+    order, most = np.zeros((n, 8), np.int32), np.zeros((n, 8, 8), np.float32)
+    _rank_moves(whole, headings, unlooked, distance, risk, step_to, weights.k_risk, order, most)
     return CoverageModel(
-        size, reach, weights, step_to, top_row, distance, risk, weights.gamma_per_m ** distance.astype(np.float64),
-        np.array(entropy), low, high, footprint, np.array(leaf_value),
+        size, headings, weights, step_to, distance, risk, weights.gamma_per_m ** distance.astype(np.float64),
+        tile_entropy,
+        _sights(whole, np.where(distance > 0.0, step_to, -1), headings, unlooked, reach, size, tile_entropy),
+        np.array(leaf_value),
         np.array(root.node), np.array(root.heading),
-        np.array(root.weight), covered, move, cost, rows, top, horizon, rollout_random,
-        fov_rad < _FULL_TURN, fresh, unlooked,
+        np.array(root.weight), tiles_of_rows(np.array(root.covered), size),
+        groups.move, groups.cost, groups.tile, groups.word, horizon, rollout_random,
+        headings > 1, order, most,
     )  # fmt: skip
+
+
+def _room(sets: int, reach: int, size: int) -> TileLists:
+    """Room for so many footprints: each may lie in this many tiles. (Memory is taken when it is written to.)"""
+    return empty_lists(sets, sets * min(((2 * reach + 7) // 8 + 1) ** 2, tile_count(size)))
+
+
+def _sights(
+    whole: TileLists,
+    step_to: NDArray[np.int32],
+    headings: int,
+    unlooked: NDArray[np.bool_],
+    reach: int,
+    size: int,
+    tile_entropy: NDArray[np.float64],
+) -> TileLists:
+    """`CoverageModel.sight`: what each step newly shows, then the footprints."""
+    n = size * size
+    under = np.arange(8)[None, :] if headings > 1 else np.zeros((1, 8), np.int64)
+    to = np.where(step_to >= 0, step_to * headings + under, -1).astype(np.int32).ravel()
+    own = np.arange(n)[:, None] * headings + under
+    minus = np.where(unlooked[:, None], -1, own).astype(np.int32).ravel()
+    steps = _room(8 * n, reach, size)
+    fill_differences(whole, to, minus, tile_entropy, 0, steps)
+    first, second = trimmed(steps), trimmed(whole)
+    return TileLists(
+        np.concatenate([first.start, first.start[-1] + second.start[1:]]).astype(np.int32),
+        np.concatenate([first.tile, second.tile]),
+        np.concatenate([first.word, second.word]),
+        np.concatenate([first.entropy, second.entropy]),
+    )

@@ -1,8 +1,8 @@
 """The local coverage problem as a generative model: motion and observation model and reward (paper, LCP and Eq. 5).
 
 Shared by lcp, reconciler and baselines. State (int64): node, heading, key of the simulation's risk outcomes, moves
-made, then one word a lattice row with the bits of the nodes that this simulation has covered. Actions: 0..7 one move
-in that direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule. Observation:
+made, then one word a tile of 8 x 8 nodes with the bits of those that this simulation has covered. Actions: 0..7 one
+move in that direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule. Observation:
 blocked or not, and how much was newly covered, binned. Whether an edge is blocked is drawn once a simulation (a hash
 of its key), so that a blocked edge stays blocked and is worth finding out about.
 """
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planning.bits import count_bits, lowest_bit
+from planning.coverage_tiles import TileLists, count_fresh, cover
 from planning.kernels import njit, njit_borrowing
 from planning.pomcp import (
     SearchSettings,
@@ -35,40 +35,39 @@ SWEEP_STEPS = 6
 MAX_EDGE_RISK = 0.9
 _BINS = (0.02, 0.5, 1.5, 3.0)
 _BLOCKED = 8
-_ONE = np.uint64(1)
 _TURN = np.array([[min((a - b) % 8, (b - a) % 8) / 4.0 for b in range(8)] for a in range(8)])
 
 
 class CoverageModel(NamedTuple):
-    """The Local IRM and what the simulations need of it; n nodes, size * size.
+    """The Local IRM and what the simulations need of it; n nodes, size * size. Sets of nodes are words of tiles.
 
-    step_to: (n, 8), the neighbour in each direction, -1 outside. top: (n,), lattice row of the footprint's first row.
-    edge_distance_m, edge_risk, edge_discount: (n, 8). entropy: (n,), nats of whole patches. footprint: (n, 8, rows),
-    the nodes not covered at the root that the sensor covers from a node under a heading, shifted to lattice columns.
-    leaf_value: (n,). particle_*: (p,), the root belief. covered: (size,) bits that count as covered already: whatever
-    is asked of the model is asked with these covered, or more. row_low, row_high: (n, 8), the rows of the footprint
-    that are not empty, half open. cluster_*: groups of uncovered nodes for the informed
-    rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_rows (c, 3) words, cluster_top (c,) first row.
-    looks_on_turn: whether turning shows something new: not to a sensor that looks all around. It has looked from where
-    the robot stands; what the model still promises there would be seen from the node's anchor.
+    headings: 8, or 1 for a sensor that looks all around. step_to: (n, 8), the neighbour in each direction, -1 outside.
+    edge_distance_m, edge_risk, edge_discount: (n, 8). entropy: (64 tiles,), nats of whole patches, in the order of
+    `coverage_tiles.by_tile`. sight: of the nodes not covered at the root, set 8 node + k is what the sensor sees from
+    the end of a step k and not, under the same heading, from its start (from a node of `unlooked` ones: all); set
+    8 n + node headings + heading is all that it sees from a node under a heading (0 for one that looks all around).
+    leaf_value: (n,). particle_*: (p,), the root belief. covered: (tiles,) bits that count as covered already: whatever
+    is asked of the model is asked with these covered, or more. cluster_*: groups of uncovered nodes for the informed
+    rule: cluster_move (n, c) first moves, cluster_cost (n, c), cluster_tile, cluster_word (c, 4), empty ones last.
     horizon: moves of every simulation, in the tree and the rollout together, so that values of short and of long
-    actions compare. fresh_most: (n, h, 8), the most that a move can newly cover, by the heading under which the sensor
-    has looked from the node, h = 8, or 1 for one that looks all around. unlooked: (n,), the nodes of the root belief
-    from which something uncovered is in sight: there, and only there, this bound does not hold.
+    actions compare. looks_on_turn: whether turning shows something new: not to a sensor that looks all around. It has
+    looked from where the robot stands; what the model still promises there would be seen from the node's anchor.
+    move_order: (n, 8), the moves from a node under a heading by falling `most_score`, 3 bits each. most_score:
+    (n, 8, 8), by node, heading and place in that order, the most that such a move can score, 0 when nothing or less.
+    Both the sets of steps and the scores hold where the sensor has looked from the node under that heading. That is so
+    after every move; of the nodes of the root belief, those from which it has not are `unlooked`, and there the model
+    takes it that nothing has been seen.
     """
 
     size: int
-    reach: int
+    headings: int
     weights: RewardParameters
     step_to: NDArray[np.int32]
-    top: NDArray[np.int32]
     edge_distance_m: NDArray[np.float32]
     edge_risk: NDArray[np.float32]
     edge_discount: NDArray[np.float64]
     entropy: NDArray[np.float64]
-    row_low: NDArray[np.int8]
-    row_high: NDArray[np.int8]
-    footprint: NDArray[np.uint64]
+    sight: TileLists
     leaf_value: NDArray[np.float64]
     particle_node: NDArray[np.int32]
     particle_heading: NDArray[np.uint8]
@@ -76,81 +75,44 @@ class CoverageModel(NamedTuple):
     covered: NDArray[np.uint64]
     cluster_move: NDArray[np.int8]
     cluster_cost: NDArray[np.float32]
-    cluster_rows: NDArray[np.uint64]
-    cluster_top: NDArray[np.int32]
+    cluster_tile: NDArray[np.uint8]
+    cluster_word: NDArray[np.uint64]
     horizon: int
     rollout_random: float
     looks_on_turn: bool
-    fresh_most: NDArray[np.int16]
-    unlooked: NDArray[np.bool_]
+    move_order: NDArray[np.int32]
+    most_score: NDArray[np.float32]
 
 
 @njit_borrowing
-def new_nodes(
-    footprint: NDArray[np.uint64],
-    row_low: NDArray[np.int8],
-    row_high: NDArray[np.int8],
-    top: int,
-    node: int,
-    heading: int,
-    covered: NDArray[np.uint64],
-) -> int:
-    """How many nodes one look from (node, heading) would newly cover; top: lattice row of the footprint's row 0."""
-    total = 0
-    for r in range(row_low[node, heading], row_high[node, heading]):
-        total += count_bits(footprint[node, heading, r] & ~covered[top + r])
-    return total
+def footprint_set(model: CoverageModel, node: int, heading: int) -> int:
+    """Which set of `model.sight` is what the sensor sees from a node under a heading."""
+    return model.headings * node + 8 * model.step_to.shape[0] + (heading if model.headings > 1 else 0)
+
+
+@njit_borrowing
+def new_nodes(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64]) -> int:
+    """How many nodes one look from (node, heading) would newly cover; covered: (tiles,)."""
+    return count_fresh(model.sight, footprint_set(model, node, heading), covered)
 
 
 @njit_borrowing
 def look(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64]) -> float:
-    """Cover what is seen from (node, heading). Returns I, the sum of the entropies of the newly covered nodes."""
-    return _look(
-        model.footprint,
-        model.row_low,
-        model.row_high,
-        model.entropy,
-        model.size,
-        model.top[node],
-        node,
-        heading,
-        covered,
-    )
+    """Cover what is seen from (node, heading); covered: (tiles,), changed.
+
+    Returns I, the sum of the entropies of the newly covered nodes.
+    """
+    return cover(model.sight, footprint_set(model, node, heading), model.entropy, covered)
 
 
 @njit_borrowing
 def look_on_turn(
     model: CoverageModel, node: int, heading: int, turned: int, covered: NDArray[np.uint64]
 ) -> float:
-    """What the turn from a heading to another newly covers at a node; covered: (size,), changed."""
+    """What the turn from a heading to another newly covers at a node; covered: (tiles,), changed."""
     if turned == heading or not model.looks_on_turn:
         return 0.0
     return look(model, node, turned, covered)
-
-
-@njit_borrowing
-def _look(
-    footprint: NDArray[np.uint64],
-    row_low: NDArray[np.int8],
-    row_high: NDArray[np.int8],
-    entropy: NDArray[np.float64],
-    size: int,
-    top: int,
-    node: int,
-    heading: int,
-    covered: NDArray[np.uint64],
-) -> float:
-    information = 0.0
-    for r in range(row_low[node, heading], row_high[node, heading]):
-        row = top + r
-        fresh = footprint[node, heading, r] & ~covered[row]
-        if fresh == np.uint64(0):
-            continue
-        covered[row] |= fresh
-        while fresh != np.uint64(0):
-            information += entropy[row * size + lowest_bit(fresh)]
-            fresh &= fresh - _ONE
-    return information
 
 
 @njit_borrowing
@@ -175,53 +137,49 @@ def turn_share(heading: int, k: int) -> float:
 
 
 @njit_borrowing
+def move_cost(distance_m: float, heading: int, k: int) -> float:
+    """What the informed rule divides a gain by: the way, and the turn to direction k (0.7 m for half a turn)."""
+    return distance_m + 0.7 * _TURN[heading, k]
+
+
+@njit_borrowing
 def _move(
-    model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], k: int
+    model: CoverageModel, node: int, heading: int, key: int, covered: NDArray[np.uint64], k: int
 ) -> tuple[float, float, float, bool]:
-    """One move. Returns (information, cost, distance, blocked); a blocked robot has turned and stays."""
-    node, heading = state[NODE], state[HEADING]
+    """One move. Returns (information, cost, distance, blocked); a blocked robot has turned to k and stays."""
     turn = turn_share(heading, k)
     distance, risk = float(model.edge_distance_m[node, k]), float(model.edge_risk[node, k])
-    state[HEADING] = k
     information = look_on_turn(model, node, heading, k, covered)
-    if edge_blocked(model, state[KEY], node, k):
+    if edge_blocked(model, key, node, k):
         return information, action_cost(model.weights, 0.0, risk, turn), 0.5 * distance, True
-    state[NODE] = model.step_to[node, k]
-    information += look(model, state[NODE], k, covered)
+    information += cover(model.sight, 8 * node + k, model.entropy, covered)
     return information, action_cost(model.weights, distance, risk, turn), distance, False
 
 
 @njit_borrowing
 def best_gain_direction(
-    model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int
+    model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64], tried: int
 ) -> int:
-    """The move with the best one-step gain for its travel and risk, or -1 when no move covers anything."""
-    node, heading = state[NODE], state[HEADING]
-    footprint, row_low, row_high = model.footprint, model.row_low, model.row_high
-    edge_distance_m, edge_risk, step_to, tops = (
-        model.edge_distance_m,
-        model.edge_risk,
-        model.step_to,
-        model.top,
-    )
-    k_risk = model.weights.k_risk
-    bounded, fresh_most = not model.unlooked[node], model.fresh_most
-    under = heading if fresh_most.shape[1] > 1 else 0
+    """The move with the best one-step gain for its travel and risk, or -1 when no move covers anything.
+
+    Of equal ones the first direction. tried: bits of directions not to take.
+    """
+    order, k_risk = model.move_order[node, heading], model.weights.k_risk
     best, best_score = -1, 0.0
     for i in range(8):
-        # Straight ahead first: it often wins, and then what others could gain at most settles them.
-        k = heading if i == 0 else (i - 1 if i - 1 < heading else i)
-        distance = edge_distance_m[node, k]
-        if distance <= 0.0 or (tried >> k) & 1 or edge_risk[node, k] > MAX_EDGE_RISK:
+        if model.most_score[node, heading, i] <= best_score:
+            break
+        k = np.int64((order >> (3 * i)) & 7)
+        if (tried >> k) & 1:
             continue
-        cost, risk_cost = distance + 0.7 * _TURN[heading, k], k_risk * edge_risk[node, k]
-        if bounded and 0.5000001 * fresh_most[node, under, k] < (best_score + risk_cost) * cost:
-            continue
-        other = step_to[node, k]
-        gain = new_nodes(footprint, row_low, row_high, tops[other], other, k, covered)
+        if k == heading or not model.looks_on_turn:
+            gain = count_fresh(model.sight, 8 * node + k, covered)
+        else:
+            gain = new_nodes(model, model.step_to[node, k], k, covered)
         if gain == 0:
             continue
-        score = 0.5 * gain / cost - risk_cost
+        cost = move_cost(model.edge_distance_m[node, k], heading, k)
+        score = 0.5 * gain / cost - k_risk * model.edge_risk[node, k]
         if score > best_score or (score == best_score and k < best):
             best, best_score = k, score
     return best
@@ -230,9 +188,11 @@ def best_gain_direction(
 @njit_borrowing
 def cluster_left(model: CoverageModel, c: int, covered: NDArray[np.uint64]) -> bool:
     """Whether a node of the group is still uncovered."""
-    for r in range(3):
-        row = model.cluster_top[c] + r
-        if row < model.size and (model.cluster_rows[c, r] & ~covered[row]) != np.uint64(0):
+    for i in range(4):
+        word = model.cluster_word[c, i]
+        if word == np.uint64(0):
+            return False
+        if (word & ~covered[np.int64(model.cluster_tile[c, i])]) != np.uint64(0):
             return True
     return False
 
@@ -241,7 +201,7 @@ def cluster_left(model: CoverageModel, c: int, covered: NDArray[np.uint64]) -> b
 def nearest_cluster(model: CoverageModel, node: int, covered: NDArray[np.uint64]) -> int:
     """The uncovered group that is the shortest way off (not one whose viewpoint this is), or -1."""
     nearest, nearest_cost = -1, np.float32(np.inf)
-    for c in range(model.cluster_top.shape[0]):
+    for c in range(model.cluster_tile.shape[0]):
         if model.cluster_cost[node, c] >= nearest_cost or model.cluster_move[node, c] < 0:
             continue
         if cluster_left(model, c, covered):
@@ -251,7 +211,7 @@ def nearest_cluster(model: CoverageModel, node: int, covered: NDArray[np.uint64]
 
 @njit_borrowing
 def informed_move(
-    model: CoverageModel, state: NDArray[np.int64], covered: NDArray[np.uint64], tried: int, group: int
+    model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64], tried: int, group: int
 ) -> tuple[int, int]:
     """The informed rule: the next move (-1: nothing left to cover) and the group that it goes to (-1: none).
 
@@ -259,7 +219,6 @@ def informed_move(
     directions not to take. On the way to a group it does not waver: it looks again only when the group is covered or
     reached.
     """
-    node = state[NODE]
     if (
         group >= 0
         and model.cluster_move[node, group] >= 0
@@ -267,7 +226,7 @@ def informed_move(
         and cluster_left(model, group, covered)
     ):
         return np.int64(model.cluster_move[node, group]), group  # type: ignore[return-value]
-    k = best_gain_direction(model, state, covered, tried)
+    k = best_gain_direction(model, node, heading, covered, tried)
     if k >= 0:
         return k, -1
     group = nearest_cluster(model, node, covered)
@@ -296,8 +255,8 @@ def _sample(model: CoverageModel, rng: NDArray[np.uint64], state: NDArray[np.int
     state[HEADING] = model.particle_heading[particle]
     state[KEY] = np.int64(random_bits(rng) >> np.uint64(1))
     state[MOVES] = 0
-    for row in range(model.size):
-        state[BITS + row] = np.int64(model.covered[row])
+    for tile in range(model.covered.shape[0]):
+        state[BITS + tile] = np.int64(model.covered[tile])
 
 
 @njit
@@ -306,26 +265,25 @@ def _step(
 ) -> tuple[int, float, float, bool]:
     covered = state[BITS:].view(np.uint64)
     steps = 1 if action < 8 else (MACRO_STEPS if action < SWEEP else SWEEP_STEPS)
-    total, seen, discount, blocked, group, before = 0.0, 0.0, 1.0, False, -1, state[MOVES]
-    for _ in range(min(steps, model.horizon - state[MOVES])):
+    node, heading, key, before = state[NODE], state[HEADING], state[KEY], state[MOVES]
+    total, seen, discount, blocked, group, moves = 0.0, 0.0, 1.0, False, -1, before
+    for _ in range(min(steps, model.horizon - before)):
         k = action % 8
         if action == SWEEP:
-            k, group = informed_move(model, state, covered, 0, group)
-        if (
-            k < 0
-            or model.edge_distance_m[state[NODE], k] <= 0.0
-            or model.edge_risk[state[NODE], k] > MAX_EDGE_RISK
-        ):
+            k, group = informed_move(model, node, heading, covered, 0, group)
+        if k < 0 or model.edge_distance_m[node, k] <= 0.0 or model.edge_risk[node, k] > MAX_EDGE_RISK:
             break
-        start = state[NODE]
-        state[MOVES] += 1
-        information, cost, distance, blocked = _move(model, state, covered, k)
+        moves += 1
+        information, cost, distance, blocked = _move(model, node, heading, key, covered, k)
         group = -1 if information > 0.0 else group
         total += discount * (model.weights.k_information * information - cost)
         seen += information
-        discount *= _discount(model, start, k, distance)
+        discount *= _discount(model, node, k, distance)
+        heading = k
         if blocked:
             break
+        node = np.int64(model.step_to[node, k])
+    state[NODE], state[HEADING], state[MOVES] = node, heading, moves
     if state[MOVES] >= model.horizon:
         total += discount * model.leaf_value[state[NODE]]
     elif state[MOVES] == before:  # nothing was left to do: the simulation would stand still for ever
@@ -359,24 +317,27 @@ def _rollout(
     model: CoverageModel, state: NDArray[np.int64], depth_left: int, rng: NDArray[np.uint64]
 ) -> float:
     covered = state[BITS:].view(np.uint64)
+    node, heading, key = state[NODE], state[HEADING], state[KEY]
     value, discount, tried, group = 0.0, 1.0, 0, -1
     for _ in range(model.horizon - state[MOVES]):
-        node, k = state[NODE], -1
+        k = -1
         if random_uniform(rng) < model.rollout_random:
             k, group = np.int64(random_below(rng, 8)), -1  # type: ignore[assignment]
             if model.edge_distance_m[node, k] <= 0.0 or model.edge_risk[node, k] > 0.1:
                 k = -1
         if k < 0:
-            k, group = informed_move(model, state, covered, tried, group)
+            k, group = informed_move(model, node, heading, covered, tried, group)
         if k < 0:
             break
-        information, cost, distance, blocked = _move(model, state, covered, k)
+        information, cost, distance, blocked = _move(model, node, heading, key, covered, k)
         if information > 0.0:
             group = -1
         tried = tried | (1 << k) if blocked else 0
         value += discount * (model.weights.k_information * information - cost)
         discount *= _discount(model, node, k, distance)
-    return value + discount * model.leaf_value[state[NODE]]
+        node, heading = node if blocked else np.int64(model.step_to[node, k]), k
+    state[NODE], state[HEADING] = node, heading
+    return value + discount * model.leaf_value[node]
 
 
 register_model(CoverageModel, sample=_sample, step=_step, actions=_actions, rollout=_rollout)
@@ -392,14 +353,14 @@ def search_coverage(
 
 @njit
 def rollout_value(model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64], rng: NDArray[np.uint64], count: int) -> float:  # fmt: skip  # noqa: E501
-    """Mean value of the informed rollout from (node, heading) with these nodes covered; covered: (size,), kept."""
-    state = np.empty(BITS + model.size, np.int64)
+    """Mean value of the informed rollout from (node, heading) with these nodes covered; covered: (tiles,), kept."""
+    state = np.empty(BITS + covered.shape[0], np.int64)
     total = 0.0
     for _ in range(count):
         state[NODE], state[HEADING], state[MOVES] = node, heading, 0
         state[KEY] = np.int64(random_bits(rng) >> np.uint64(1))
-        for row in range(model.size):
-            state[BITS + row] = np.int64(covered[row])
+        for tile in range(covered.shape[0]):
+            state[BITS + tile] = np.int64(covered[tile])
         total += _rollout(model, state, 1, rng)
     return total / max(count, 1)
 
@@ -417,7 +378,7 @@ def evaluate_moves(
 ) -> int:
     """Expected reward of each step of a path under the current belief (paper, Eq. 17).
 
-    moves: (k,) directions. covered: (size,), changed: what the path covers. A step that fails (probability rho) turns
+    moves: (k,) directions. covered: (tiles,), changed: what the path covers. A step that fails (probability rho) turns
     the robot, drives nowhere and ends the path; alive_out: probability of getting past the step. Exact when no edge
     comes twice. Returns how many steps can be made (an edge that is gone or impassable ends the path).
     """
@@ -443,17 +404,15 @@ def evaluate_moves(
 def follow_rule(
     model: CoverageModel, node: int, heading: int, covered: NDArray[np.uint64], moves_out: NDArray[np.int64]
 ) -> int:
-    """The moves of the informed rule from (node, heading) when nothing is blocked; covered: (size,), changed."""
-    state = np.zeros(BITS + model.size, np.int64)
-    state[NODE], state[HEADING] = node, heading
+    """The moves of the informed rule from (node, heading) when nothing is blocked; covered: (tiles,), changed."""
     group = -1
     for i in range(moves_out.shape[0]):
-        k, group = informed_move(model, state, covered, 0, group)
+        k, group = informed_move(model, node, heading, covered, 0, group)
         if k < 0:
             return i
-        information = look_on_turn(model, state[NODE], state[HEADING], k, covered)
-        state[NODE], state[HEADING] = model.step_to[state[NODE], k], k
-        information += look(model, state[NODE], k, covered)
+        information = look_on_turn(model, node, heading, k, covered)
+        node, heading = model.step_to[node, k], k
+        information += look(model, node, k, covered)
         group = -1 if information > 0.0 else group
         moves_out[i] = k
     return moves_out.shape[0]

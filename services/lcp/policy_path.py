@@ -18,6 +18,7 @@ from planning.coverage_model import (
     look,
     look_on_turn,
 )
+from planning.coverage_tiles import nodes_of_tiles
 from planning.lattice_graph import neighbour, travel_costs
 from planning.pomcp import PolicyTree
 from schemas.world import LocalIrm
@@ -59,9 +60,7 @@ def covered_by(model: CoverageModel, node: int, heading: int, moves: list[int]) 
         (np.zeros(len(moves)), np.zeros(len(moves)), np.zeros(len(moves))),
     )
     evaluate_moves(model, node, heading, np.array(moves, np.int64), covered, *scratch)
-    new = covered & ~model.covered
-    columns = np.arange(model.size, dtype=np.uint64)
-    return ((new[:, None] >> columns[None, :]) & np.uint64(1)).astype(np.bool_).ravel()
+    return nodes_of_tiles(covered & ~model.covered, model.size)
 
 
 def step_terms(

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from planning.coverage_model import ACTIONS, BITS, CoverageModel, rollout_value, search_coverage
+from planning.coverage_tiles import tile_count
 from planning.frames import planar
 from planning.lattice_graph import spread_values, travel_costs
 from planning.pomcp import PolicyTree, Pomcp, random_stream
@@ -69,7 +70,7 @@ class LcpStage:
         self._next_view = NextBestView(config.nbv, setup.seed)
         self._frontier_look = FrontierLook(config.hfe)
         self._solver = Pomcp(
-            state_size=BITS + 61,
+            state_size=BITS + tile_count(61),
             max_actions=ACTIONS,
             max_nodes=config.max_nodes,
             max_depth=config.max_depth,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from planning.coverage_build import RootBelief, build_model, reachable_entropy
 from planning.coverage_model import CoverageModel, evaluate_moves, look
+from planning.coverage_tiles import rows_of_tiles, tiles_of_rows
 from planning.randomness import stream
 from planning.reward import leftover_entropy, parameters
 from planning.search import dijkstra_box, trace_path
@@ -124,15 +125,17 @@ def model_here(
 def cover_along(
     model: CoverageModel, committed: Committed, irm: LocalIrm, nodes: list[int], covered: NDArray[np.uint64]
 ) -> None:
-    """Mark what the kept nodes of the path will have covered when the junction is reached; covered is changed."""
+    """Mark in covered, (size,) rows, what the kept nodes of the path will have covered at the junction."""
     if not nodes:
         return
     moves = moves_between(committed, nodes[0], nodes[-1])
     first = node_index(irm, int(committed.lattice[nodes[0], 0]), int(committed.lattice[nodes[0], 1]))
     heading = _heading_at(committed, nodes[0])
-    look(model, first, heading, covered)
+    tiles = tiles_of_rows(covered, irm.size)
+    look(model, first, heading, tiles)
     scratch = (np.zeros(len(moves)), np.zeros(len(moves)), np.zeros(len(moves)))
-    evaluate_moves(model, first, heading, moves, covered, *scratch)
+    evaluate_moves(model, first, heading, moves, tiles, *scratch)
+    covered[:] = rows_of_tiles(tiles, irm.size)
 
 
 def _heading_at(committed: Committed, position: int) -> int:

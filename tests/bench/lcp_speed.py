@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planning.coverage_model import ACTIONS, BITS, look, search_coverage
+from planning.coverage_tiles import nodes_of_tiles, tile_count
 from planning.pomcp import Pomcp
 from plgrim.evaluation.bare_walk import bare_walk, search_bare_walk
 from services.lcp.config import Config
@@ -23,7 +24,7 @@ from tests.bench.coverage_worlds import SIZE, World, model_at, random_world
 def solver(config: Config, workers: int = 1) -> Pomcp:
     """A solver as lcp has it."""
     return Pomcp(
-        state_size=BITS + SIZE,
+        state_size=BITS + tile_count(SIZE),
         max_actions=ACTIONS,
         max_nodes=config.max_nodes,
         max_depth=config.max_depth,
@@ -35,11 +36,9 @@ def solver(config: Config, workers: int = 1) -> Pomcp:
 
 def after_a_look(world: World, fov_deg: float) -> NDArray[np.float64]:
     """The entropies when the robot has looked from its start, as it always has. (n,)"""
-    words = np.zeros(world.size, np.uint64)
-    look(model_at(world, world.start, 0, fov_deg=fov_deg), world.start, 0, words)
-    columns = np.arange(world.size, dtype=np.uint64)
-    seen = ((words[:, None] >> columns[None, :]) & np.uint64(1)).ravel() > 0
-    return np.where(seen, 0.0, world.entropy)
+    tiles = np.zeros(tile_count(world.size), np.uint64)
+    look(model_at(world, world.start, 0, fov_deg=fov_deg), world.start, 0, tiles)
+    return np.where(nodes_of_tiles(tiles, world.size), 0.0, world.entropy)
 
 
 def measure(

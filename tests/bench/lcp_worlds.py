@@ -24,6 +24,7 @@ from planning.coverage_model import (
     new_nodes,
     search_coverage,
 )
+from planning.coverage_tiles import nodes_of_tiles, tile_count
 from planning.lattice_graph import travel_costs
 from planning.pomcp import Pomcp
 from planning.reward import leftover_entropy
@@ -35,12 +36,6 @@ Words = NDArray[np.uint64]
 Choose = Callable[[int, int, Words], int]
 
 
-def covered_nodes(world: World, words: Words) -> NDArray[np.bool_]:
-    """Coverage words as (n,) flags."""
-    columns = np.arange(world.size, dtype=np.uint64)
-    return np.asarray((words[:, None] >> columns[None, :]) & np.uint64(1), np.bool_).ravel()
-
-
 def greedy(world: World, model: CoverageModel) -> Choose:
     """The move that newly covers most; where none does, the first move to the nearest uncovered node."""
     n = world.size**2
@@ -50,17 +45,13 @@ def greedy(world: World, model: CoverageModel) -> Choose:
 
     def choose(node: int, heading: int, words: Words) -> int:
         gains = [
-            new_nodes(
-                model.footprint, model.row_low, model.row_high, int(model.top[other]), int(other), k, words
-            )
-            if world.distance_m[node, k] > 0.0
-            else -1
+            new_nodes(model, int(other), k, words) if world.distance_m[node, k] > 0.0 else -1
             for k, other in enumerate(model.step_to[node])
         ]
         if max(gains) > 0:
             return int(np.argmax(gains))
         cost, move = np.empty(n), np.empty(n, np.int8)
-        left = (goal > 0.0) & ~covered_nodes(world, words)
+        left = (goal > 0.0) & ~nodes_of_tiles(words, world.size)
         travel_costs(node, world.size, world.distance_m, world.risk, 0.0, MAX_EDGE_RISK, cost, move)
         cost[~left] = np.inf
         if not np.isfinite(cost).any():
@@ -85,7 +76,7 @@ def pomcp(
     done = [0]
 
     def choose(node: int, heading: int, words: Words) -> int:
-        entropy = np.where(covered_nodes(world, words), 0.0, world.entropy)
+        entropy = np.where(nodes_of_tiles(words, world.size), 0.0, world.entropy)
         entropy = reachable_entropy(
             entropy.astype(np.float32), world.visible, world.distance_m, world.size, world.reach
         )
@@ -110,7 +101,7 @@ def pomcp(
 
 def drive(world: World, model: CoverageModel, choose: Choose, steps: int) -> NDArray[np.float64]:
     """Share covered after each step, (steps,). Every step turns, looks, moves and looks again."""
-    words = np.zeros(world.size, np.uint64)
+    words = np.zeros(tile_count(world.size), np.uint64)
     node, heading = world.start, 0
     look(model, node, heading, words)
     goal = reachable_entropy(
@@ -124,7 +115,7 @@ def drive(world: World, model: CoverageModel, choose: Choose, steps: int) -> NDA
                 look(model, node, k, words)
             node, heading = int(model.step_to[node, k]), k
             look(model, node, heading, words)
-        share[step] = float((covered_nodes(world, words) & goal).sum() / goal.sum())
+        share[step] = float((nodes_of_tiles(words, world.size) & goal).sum() / goal.sum())
     return share
 
 

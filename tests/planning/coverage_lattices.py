@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from planning.coverage_build import RootBelief, build_model
 from planning.coverage_model import ACTIONS, BITS, CoverageModel
+from planning.coverage_tiles import tile_count
 from planning.pomcp import Pomcp
 from planning.reward import RewardWeights, parameters
 
@@ -161,6 +162,25 @@ class Reference:
             words[node // self.size] |= 1 << node % self.size
         return np.array(words, np.uint64)
 
+    def tiles(self, nodes: Iterable[int]) -> NDArray[np.uint64]:
+        """A set of nodes as the words of a model's tiles."""
+        side = (self.size + 7) // 8
+        words = [0] * side**2
+        for node in nodes:
+            row, column = divmod(node, self.size)
+            words[row // 8 * side + column // 8] |= 1 << row % 8 * 8 + column % 8
+        return np.array(words, np.uint64)
+
+    def in_tiles(self, tiles: NDArray[np.uint64]) -> frozenset[int]:
+        """The words of tiles as a set of nodes; bits beyond the lattice make it a node that does not exist."""
+        side, found = (self.size + 7) // 8, set()
+        for tile, word in enumerate(tiles.tolist()):
+            for bit in range(64):
+                if word >> bit & 1:
+                    row, column = tile // side * 8 + bit // 8, tile % side * 8 + bit % 8
+                    found.add(row * self.size + column if max(row, column) < self.size else -1)
+        return frozenset(found)
+
     def nodes(self, words: NDArray[np.uint64]) -> frozenset[int]:
         """Coverage words as a set of nodes; bits beyond the lattice make it a node that does not exist."""
         return frozenset(
@@ -230,7 +250,7 @@ def reachable(lattice: Reference, start: int, max_risk: float = 0.9) -> set[int]
 def coverage_solver(size: int, max_depth: int, max_nodes: int = 1 << 16, exploration: float = 0.1) -> Pomcp:
     """A solver for lattices of this size."""
     return Pomcp(
-        state_size=BITS + size,
+        state_size=BITS + tile_count(size),
         max_actions=ACTIONS,
         max_nodes=max_nodes,
         max_depth=max_depth,

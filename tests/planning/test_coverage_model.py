@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from planning.coverage_build import best_viewpoint, reachable_entropy
+from planning.coverage_build import reachable_entropy
+from planning.coverage_groups import best_viewpoint
 from planning.coverage_model import (
     BITS,
     HEADING,
@@ -27,18 +28,19 @@ from planning.coverage_model import (
     _rollout,
     _sample,
     _step,
+    best_gain_direction,
     edge_blocked,
     evaluate_moves,
     follow_rule,
     look,
     new_nodes,
     rollout_value,
-    search_coverage,
     turn_share,
 )
+from planning.coverage_tiles import cover, tile_count
 from planning.pomcp import random_bits, random_stream
 from planning.reward import RewardWeights
-from tests.planning.coverage_lattices import Edge, Reference, coverage_solver, random_lattice, reachable
+from tests.planning.coverage_lattices import Edge, Reference, random_lattice, reachable
 
 SEEDS = st.integers(0, 2**32 - 1)
 WEIGHTS = RewardWeights(
@@ -54,9 +56,9 @@ def start_of(lattice: Reference, rng: np.random.Generator) -> int:
 def state_at(
     lattice: Reference, node: int, heading: int, key: int, covered: frozenset[int], moves: int = 0
 ) -> NDArray[np.int64]:
-    state = np.zeros(BITS + lattice.size, np.int64)
+    state = np.zeros(BITS + tile_count(lattice.size), np.int64)
     state[NODE], state[HEADING], state[KEY], state[MOVES] = node, heading, key, moves
-    state[BITS:] = lattice.bits(covered).view(np.int64)
+    state[BITS:] = lattice.tiles(covered).view(np.int64)
     return state
 
 
@@ -71,14 +73,13 @@ def test_a_look_covers_the_footprint_and_pays_its_entropies(
     lattice = random_lattice(seed, size, reach, fov_deg, wall_share=0.1, hidden_share=0.3, covered_share=0.2)
     model = lattice.model()
     before = frozenset(int(i) for i in np.flatnonzero(rng.random(size * size) < 0.3))
-    covered = lattice.bits(before)
+    covered = lattice.tiles(before)
     node, heading = int(rng.integers(size * size)), int(rng.integers(8))
     fresh = lattice.footprint(node, heading) - before
-    sees = (model.footprint, model.row_low, model.row_high, model.top[node])
-    assert new_nodes(*sees, node, heading, covered) == len(fresh)
+    assert new_nodes(model, node, heading, covered) == len(fresh)
     information = look(model, node, heading, covered)
     assert math.isclose(information, lattice.information(fresh), rel_tol=1e-12, abs_tol=1e-12)
-    assert lattice.nodes(covered) == before | fresh
+    assert lattice.in_tiles(covered) == before | fresh
     assert look(model, node, heading, covered) == 0.0
 
 
@@ -94,9 +95,9 @@ def test_the_widest_lattice_fits_into_its_words() -> None:
     lattice = Reference(size, reach, 2.0 * math.pi, WEIGHTS, np.ones(size * size), {}, sees)
     model = lattice.model()
     for node, seen in sees.items():
-        covered = lattice.bits(())
+        covered = lattice.tiles(())
         assert look(model, node, 0, covered) == len(seen)
-        assert lattice.nodes(covered) == seen
+        assert lattice.in_tiles(covered) == seen
 
 
 @given(SEEDS)
@@ -164,7 +165,7 @@ def reference_action(
     """
     model = lattice.model()
     node, heading, key, moves = (int(state[i]) for i in (NODE, HEADING, KEY, MOVES))
-    covered = lattice.nodes(state[BITS:].view(np.uint64))
+    covered = lattice.in_tiles(state[BITS:].view(np.uint64))
     value, discount, blocked, before, first = 0.0, 1.0, False, covered, moves
     for k in directions:
         edge = lattice.edges.get((node, k))
@@ -259,13 +260,13 @@ def test_particles_are_drawn_as_often_as_they_weigh() -> None:
         particle_heading=np.array([1, 3, 5, 7], np.uint8),
         particle_weight=weights,
     )
-    rng, state = random_stream(4), np.zeros(BITS + 4, np.int64)
+    rng, state = random_stream(4), np.zeros(BITS + 1, np.int64)
     tally, keys = np.zeros(4), set()
     for _ in range(4000):
         state[:] = -1
         _sample(model, rng, state)
         assert state[HEADING] == 1 + 2 * (state[NODE] // 5)
-        assert lattice.nodes(state[BITS:].view(np.uint64)) == {3, 9}
+        assert lattice.in_tiles(state[BITS:].view(np.uint64)) == {3, 9}
         tally[state[NODE] // 5] += 1
         keys.add(int(state[KEY]))
     assert np.all(np.abs(tally / 4000 - weights) < 6.0 * np.sqrt(weights * (1.0 - weights) / 4000))
@@ -329,7 +330,7 @@ def test_a_path_is_worth_the_expectation_over_all_outcomes(seed: int) -> None:
     before = frozenset(int(i) for i in np.flatnonzero(rng.random(25) < 0.2))
     moves = random_path(lattice, rng, node, 6)
     expected, alive = exhaustive_rewards(lattice, node, heading, before, moves)
-    covered = lattice.bits(before)
+    covered = lattice.tiles(before)
     out = np.zeros(6), np.zeros(6), np.zeros(6)
     count = evaluate_moves(lattice.model(), node, heading, np.array(moves, np.int64), covered, *out)
     assert count == len(moves)
@@ -340,7 +341,7 @@ def test_a_path_is_worth_the_expectation_over_all_outcomes(seed: int) -> None:
         assert math.isclose(out[1][i], lattice.edges[at, k].distance_m, rel_tol=1e-9)
         at, seen, _, _ = lattice.move(at, heading, seen, k, False)
         heading = k
-    assert lattice.nodes(covered) == seen
+    assert lattice.in_tiles(covered) == seen
 
 
 @pytest.mark.parametrize("risk", [None, 0.95])
@@ -352,7 +353,7 @@ def test_a_path_ends_at_an_edge_that_is_gone_or_impassable(risk: float | None) -
         else:
             lattice.edges[node, k] = Edge(1.0, risk)
     out = np.zeros(4), np.zeros(4), np.zeros(4)
-    assert evaluate_moves(lattice.model(), 0, 0, np.zeros(4, np.int64), lattice.bits(()), *out) == 2
+    assert evaluate_moves(lattice.model(), 0, 0, np.zeros(4, np.int64), lattice.tiles(()), *out) == 2
 
 
 # --- the informed rule --------------------------------------------------------------------------------------------
@@ -373,7 +374,7 @@ def test_the_rule_stays_on_edges_and_covers_all_that_can_be_covered(seed: int) -
         assert (at, int(k)) in lattice.edges
         at, seen, _, _ = lattice.move(at, heading, seen, int(k), False)
         heading = int(k)
-    assert lattice.nodes(covered) == seen
+    assert lattice.in_tiles(covered) == seen
     within = reachable(lattice, node)
     coverable = set().union(*(lattice.sees[i] for i in within)) - lattice.sees[node]
     assert coverable <= seen
@@ -388,17 +389,16 @@ def test_every_node_that_can_be_covered_has_a_group_and_a_way_to_it(seed: int) -
     within = reachable(lattice, node)
     coverable = set().union(*(lattice.sees[i] for i in within))
     with_way: set[int] = set()
-    for c in range(len(model.cluster_top)):
+    for c in range(len(model.cluster_tile)):
         if not math.isfinite(model.cluster_cost[node, c]):
             continue
         at, steps = node, 0
         while model.cluster_move[at, c] >= 0 and steps < 64:
             assert (at, int(model.cluster_move[at, c])) in lattice.edges
             at, steps = lattice.neighbour(at, int(model.cluster_move[at, c])), steps + 1
-        words = np.zeros(9, np.uint64)
-        top = int(model.cluster_top[c])
-        words[top : top + 3] = model.cluster_rows[c][: 9 - top]
-        members = lattice.nodes(words[:8])
+        words = np.zeros_like(model.covered)
+        np.bitwise_or.at(words, model.cluster_tile[c].astype(int), model.cluster_word[c])
+        members = lattice.in_tiles(words)
         assert members & lattice.sees[at], "the way ends where nothing of the group is seen"
         with_way |= members
     assert coverable <= with_way
@@ -457,23 +457,54 @@ def test_rollouts_with_chance_stay_on_edges() -> None:
     assert len(ends) > 5
 
 
-@pytest.mark.parametrize("fov_deg", [360.0, 120.0])
-@pytest.mark.parametrize("seed", range(20))
-def test_moves_that_are_skipped_by_what_they_can_newly_show_at_most_change_nothing(
-    seed: int, fov_deg: float
+def best_by_sets(
+    lattice: Reference, node: int, heading: int, covered: frozenset[int], tried: int, k_risk: float
+) -> int:
+    """The informed rule's move by counting sets: of equal scores the first direction, -1 when nothing scores."""
+    best, best_score = -1, 0.0
+    for k in lattice.directions(node):
+        edge = lattice.edges[node, k]
+        if tried >> k & 1 or edge.risk > MAX_EDGE_RISK:
+            continue
+        gain = len(lattice.footprint(lattice.neighbour(node, k), k) - covered)
+        turn = min((heading - k) % 8, (k - heading) % 8) / 4.0
+        score = 0.5 * gain / (edge.distance_m + 0.7 * turn) - k_risk * edge.risk
+        if score > best_score:
+            best, best_score = k, score
+    return best
+
+
+@settings(max_examples=200)
+@given(SEEDS, st.sampled_from([60.0, 120.0, 360.0]), st.booleans(), st.booleans(), st.integers(0, 255))
+def test_the_best_move_is_that_of_counting_all_of_them(
+    seed: int, fov_deg: float, at_root: bool, even: bool, tried: int
 ) -> None:
-    """Having looked from where it came to, the rule and so the search are the same as without that short cut; where the
-    root has not been looked from, too."""
-    lattice = random_lattice(seed, 7, 2, fov_deg, wall_share=0.15, risky_share=0.3, covered_share=0.2)
-    start, heading = sorted({node for node, _ in lattice.edges})[seed % 5], seed % 8
-    for looked in (lattice.footprint(start, heading), ()):
-        model = lattice.model(start, heading, looked, rollout_random=0.1)
-        assert model.unlooked[start] == bool(set(lattice.footprint(start, heading)) - set(looked))
-        plain = model._replace(unlooked=np.ones_like(model.unlooked))
-        trees = []
-        for each in (model, plain):
-            solver = coverage_solver(7, max_depth=12)
-            solver.search(search_coverage, each, seed=seed, simulations=400)
-            trees.append(solver.root())
-        assert trees[0].visits.tolist() == trees[1].visits.tolist()
-        assert trees[0].values.tolist() == trees[1].values.tolist()
+    """Where the sensor has looked from the node, and at the root, from which it has not. even: many ties."""
+    rng = np.random.default_rng(seed)
+    lattice = random_lattice(seed, 9, 2, fov_deg, wall_share=0.2, risky_share=0.0 if even else 0.3)
+    if even:
+        for node, k in lattice.edges:
+            lattice.edges[node, k] = Edge(1.0, 0.0)
+    root, node, heading = start_of(lattice, rng), start_of(lattice, rng), int(rng.integers(8))
+    node = root if at_root else node
+    before = frozenset(int(i) for i in np.flatnonzero(rng.random(81) < rng.choice([0.0, 0.3, 0.9, 1.0])))
+    model = lattice.model(root, heading, before if seed % 2 else ())
+    if not at_root:
+        before |= lattice.footprint(node, heading)
+    found = best_gain_direction(model, node, heading, lattice.tiles(before), tried & 0x55)
+    assert found == best_by_sets(lattice, node, heading, before, tried & 0x55, model.weights.k_risk)
+
+
+@pytest.mark.parametrize("fov_deg", [360.0, 120.0])
+def test_only_a_root_that_something_is_to_be_seen_from_is_unlooked(fov_deg: float) -> None:
+    """There a step shows all that its end does; elsewhere what its start did not."""
+    lattice = random_lattice(5, 9, 2, fov_deg, wall_share=0.15)
+    start, heading = start_of(lattice, np.random.default_rng(5)), 3
+    for looked in (lattice.footprint(start, heading), frozenset[int]()):
+        model = lattice.model(start, heading, looked)
+        for node, k in lattice.edges:
+            tiles = np.zeros(tile_count(9), np.uint64)
+            cover(model.sight, 8 * node + k, model.entropy, tiles)
+            own = frozenset[int]() if node == start and not looked else lattice.footprint(node, k)
+            expected = lattice.footprint(lattice.neighbour(node, k), k) - looked - own
+            assert lattice.in_tiles(tiles) == expected

@@ -11,8 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from planning.lattice_graph import neighbour, spread_values, travel_costs
-from tests.planning.coverage_lattices import STEPS, Reference, random_lattice
+from planning.lattice_graph import (
+    empty_heap,
+    neighbour,
+    passable_edges,
+    spread_values,
+    travel_costs,
+    travel_costs_over,
+)
+from planning.search import heap_pop, heap_push_or_lower
+from tests.planning.coverage_lattices import STEPS, Edge, Reference, random_lattice
 
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -61,6 +69,47 @@ def test_travel_costs_are_those_of_dijkstra_and_the_moves_lead_there(
             at, steps = lattice.neighbour(at, int(move[at])), steps + 1
         assert at == source
         assert math.isclose(spent, cost[node], rel_tol=1e-6, abs_tol=1e-9)
+
+
+def plain_dijkstra(
+    lattice: Reference, source: int, risk_weight_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    """With the heap of `planning.search`: of equal ways the one that this order of taking nodes finds first."""
+    n = lattice.size**2
+    heap, place = np.empty(n, np.int32), np.full(n, -1, np.int32)
+    cost, move = np.full(n, np.inf), np.full(n, -1, np.int8)
+    count = heap_push_or_lower(heap, place, cost, 0, source, 0.0)
+    while count > 0:
+        node = heap_pop(heap, place, cost, count)
+        count -= 1
+        for k in lattice.directions(node):
+            edge, other = lattice.edges[node, k], lattice.neighbour(node, k)
+            value = cost[node] + edge.distance_m + risk_weight_m * edge.risk
+            if value < cost[other] - 1e-12:
+                move[other] = (k + 4) % 8
+                count = heap_push_or_lower(heap, place, cost, count, other, value)
+    return cost, move
+
+
+@settings(max_examples=60)
+@given(SEEDS, st.integers(1, 12), st.booleans(), st.floats(0.0, 0.4))
+def test_ways_from_many_sources_over_the_same_edges_and_of_equal_ones_the_same(
+    seed: int, size: int, even: bool, walls: float
+) -> None:
+    """even: lengths of 1 and sqrt 2, where nearly every way has others as long."""
+    lattice = random_lattice(seed, size, 1, wall_share=walls, risky_share=0.0 if even else 0.4)
+    if even:
+        for node, k in lattice.edges:
+            lattice.edges[node, k] = Edge(float(np.float32(math.hypot(*STEPS[k]))), 0.0)
+    n = size * size
+    distance, risk = columns(lattice)
+    edges, heap = passable_edges(size, distance, risk, 1.7, 0.9), empty_heap(n)
+    cost, move = np.empty(n), np.empty(n, np.int8)
+    for source in {0, seed % n, n - 1}:
+        travel_costs_over(edges, source, heap, cost, move)
+        expected = plain_dijkstra(lattice, source, 1.7)
+        np.testing.assert_array_equal(cost, expected[0])
+        np.testing.assert_array_equal(move, expected[1])
 
 
 @settings(max_examples=40)

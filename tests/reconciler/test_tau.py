@@ -47,7 +47,7 @@ def plain_terms(
     discount = alive = 1.0
     covered = before
     for i in range(len(moves) + 1):
-        words = lattice.bits(covered)
+        words = lattice.tiles(covered)
         replanned.append(discount * alive * ratio * rollout_value(model, node, heading, words, rng, 4))
         first = np.zeros(1, np.int64)
         found = follow_rule(model, node, heading, words.copy(), first)
@@ -83,7 +83,7 @@ def test_the_terms_of_every_prefix(seed: int, ratio: float) -> None:
     np.testing.assert_allclose(terms.kept, kept, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(terms.replanned, replanned, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(terms.mismatch, mismatch, atol=1e-12)
-    assert lattice.nodes(model.covered) == before, "the model's own coverage is not touched"
+    assert lattice.in_tiles(model.covered) == before, "the model's own coverage is not touched"
 
 
 @settings(max_examples=60)
