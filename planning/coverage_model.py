@@ -169,7 +169,7 @@ def best_gain_direction(
     for i in range(8):
         if model.most_score[node, heading, i] <= best_score:
             break
-        k = np.int64((order >> (3 * i)) & 7)
+        k: int = np.int64((order >> (3 * i)) & 7)  # type: ignore[assignment]  # the compiler's int
         if (tried >> k) & 1:
             continue
         if k == heading or not model.looks_on_turn:

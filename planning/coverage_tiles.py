@@ -186,7 +186,7 @@ def fill_differences(
                 for e in range(lists.start[minus[i]], lists.start[minus[i] + 1]):
                     gone[lists.tile[e]] = lists.word[e]
             for e in range(lists.start[to[i]], lists.start[to[i] + 1]):
-                tile = np.int64(lists.tile[e])
+                tile: int = np.int64(lists.tile[e])  # type: ignore[assignment]  # the compiler's int
                 count = _append(out, count, tile, lists.word[e] & ~gone[tile], entropy)
             if minus[i] >= 0:
                 for e in range(lists.start[minus[i]], lists.start[minus[i] + 1]):

@@ -113,7 +113,7 @@ def _pop(heap: Heap, count: int) -> int:
     heap.key[count - 1] = np.inf
     slot, below = 0, 1
     while below < count - 1:
-        below += np.int64(heap.key[below + 1] < heap.key[below])
+        below += np.int64(heap.key[below + 1] < heap.key[below])  # type: ignore[assignment]  # the compiler's int
         heap.key[slot], heap.item[slot] = heap.key[below], heap.item[below]
         heap.place[heap.item[slot]] = slot
         slot, below = below, 2 * below + 1
