@@ -188,7 +188,7 @@ def build_model(
     n, headings = size * size, 1 if fov_rad >= _FULL_TURN else 8
     free = ~np.array(root.covered) & np.uint64((1 << size) - 1)
     whole = _room(n * headings, reach, size)
-    fill_footprints(seen, wedge_rows(reach, fov_rad)[:headings], free, tile_entropy, 0, whole)
+    fill_footprints(seen, wedge_rows(reach, fov_rad)[:headings], free, tile_entropy, whole)
     own = root.node.astype(np.int64) * headings + (root.heading.astype(np.int64) if headings > 1 else 0)
     unlooked = np.zeros(n, np.bool_)
     unlooked[root.node[whole.start[own] < whole.start[own + 1]]] = True
@@ -227,7 +227,7 @@ def _sights(
     own = np.arange(n)[:, None] * headings + under
     minus = np.where(unlooked[:, None], -1, own).astype(np.int32).ravel()
     steps = _room(8 * n, reach, size)
-    fill_differences(whole, to, minus, tile_entropy, 0, steps)
+    fill_differences(whole, to, minus, tile_entropy, steps)
     first, second = trimmed(steps), trimmed(whole)
     return TileLists(
         np.concatenate([first.start, first.start[-1] + second.start[1:]]).astype(np.int32),

@@ -154,19 +154,18 @@ def fill_footprints(
     wedge: NDArray[np.uint32],
     free: NDArray[np.uint64],
     entropy: NDArray[np.float64],
-    first: int,
     lists: TileLists,
 ) -> None:
-    """What is visible, in the field of view and free, by node and heading: sets first + node h + heading, out.
+    """What is visible, in the field of view and free, by node and heading: sets node h + heading of `lists`, out.
 
     visible: (n, 2 reach + 1), bits around each node. wedge: (h, 2 reach + 1), the field of view under each heading.
-    free: (size,) rows, the nodes that count. entropy: as `by_tile`. Entries follow those of the sets before.
+    free: (size,) rows, the nodes that count. entropy: as `by_tile`.
     """
-    count, headings, rows = lists.start[first], wedge.shape[0], np.empty(8, np.uint64)
+    count, headings, rows = lists.start[0], wedge.shape[0], np.empty(8, np.uint64)
     for node in range(visible.shape[0]):
         for k in range(headings):
             count = _append_footprint(lists, count, node, visible[node], wedge[k], free, entropy, rows)
-            lists.start[first + node * headings + k + 1] = count
+            lists.start[node * headings + k + 1] = count
 
 
 @njit
@@ -175,11 +174,10 @@ def fill_differences(
     to: NDArray[np.int32],
     minus: NDArray[np.int32],
     entropy: NDArray[np.float64],
-    first: int,
     out: TileLists,
 ) -> None:
-    """Set first + i of `out`: set to[i] of `lists` without set minus[i]; -1 is the empty set. to, minus: (k,)."""
-    count, gone = out.start[first], np.zeros(entropy.shape[0] // 64, np.uint64)
+    """Set i of `out`: set to[i] of `lists` without set minus[i]; -1 is the empty set. to, minus: (k,)."""
+    count, gone = out.start[0], np.zeros(entropy.shape[0] // 64, np.uint64)
     for i in range(to.shape[0]):
         if to[i] >= 0:
             if minus[i] >= 0:
@@ -191,7 +189,7 @@ def fill_differences(
             if minus[i] >= 0:
                 for e in range(lists.start[minus[i]], lists.start[minus[i] + 1]):
                     gone[lists.tile[e]] = np.uint64(0)
-        out.start[first + i + 1] = count
+        out.start[i + 1] = count
 
 
 def empty_lists(count: int, entries: int) -> TileLists:

@@ -67,6 +67,8 @@ def leftover_entropy(
     and (1 + leftover_weight f) times, f the share of its known neighbours that are covered. With both at 0, the
     default, it is the paper's reward.
     """
+    if weights.leftover_weight == 0.0:
+        return np.where(entropy > 0.0, np.maximum(entropy, weights.leftover_gain), 0.0)
     wanted, traversable = (entropy > 0.0).reshape(size, size), known.reshape(size, size)
     done, neighbours = np.zeros((size, size)), np.zeros((size, size))
     padded_done, padded_known = np.pad(traversable & ~wanted, 1), np.pad(traversable | wanted, 1)

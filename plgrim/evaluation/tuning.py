@@ -30,7 +30,7 @@ def _hfe(**changes: object) -> Overlay:
 
 
 _LEFTOVERS = {"leftover_weight": 3.0, "leftover_gain": 0.3}
-"""As PLGRIM counts them."""
+"""Weighed up: PLGRIM counted them so before it was measured that plain ones cover more."""
 
 GRID: Mapping[str, Mapping[str, Overlay]] = {
     "nbv": {

@@ -59,13 +59,7 @@ def _corridor(now: int, x_m: float, spec: GridSpec, heights: bool) -> RiskMap:
     zero = np.zeros(spec.shape, np.float32)
     return RiskMap(
         stamp_ns=now,
-        grid=GridHeader(
-            resolution_m=spec.resolution_m,
-            ix0=spec.ix0,
-            iy0=spec.iy0,
-            width=spec.width,
-            height=spec.height,
-        ),
+        grid=GridHeader(**spec._asdict()),
         robot_pose=Pose(x_m=x_m),
         footprint_radius_m=0.25,
         state=state,

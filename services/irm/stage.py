@@ -267,7 +267,7 @@ class IrmStage:
         first = self._roadmap.version == 0
         message = self._roadmap.message(odometry.pose, self._frame_pose(odometry), now, whole or first)
         s, picture = moved(window.spec, window_picture(window), window.frame)
-        header = GridHeader(resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, width=s.width, height=s.height)
+        header = GridHeader(**s._asdict())
         return [
             Output(GLOBAL_IRM, message),
             Output(COVERAGE, self._summary(now, ground_m2, covered_m2)),

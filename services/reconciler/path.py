@@ -21,6 +21,8 @@ STEP_M = 0.1
 _FREE = FREE
 _WAY_OUT_M = 1.0
 _SHARP_LEAST, _SHARP_MOST = math.radians(35.0), math.radians(130.0)
+_STRAIGHT = 0.3
+"""An arc's legs turn by less than this at each point, rad."""
 ARC_POINTS = 5
 """On either side of a corner: half a metre."""
 
@@ -263,13 +265,12 @@ def round_corners(
             span < ARC_POINTS
             and i - span - 1 >= begin
             and i + span + 1 < line.shape[0]
-            and abs(_turn_at(line, i - span)) < 0.3
-            and abs(_turn_at(line, i + span)) < 0.3
+            and _turn_at(line, i - span) < _STRAIGHT
+            and _turn_at(line, i + span) < _STRAIGHT
         ):
             span += 1
         _put_arc(line, i, span, clearance_m, resolution_m, ix0, iy0, comfort_m)
         i += span
-    return
 
 
 @njit
@@ -296,12 +297,12 @@ def _put_arc(
     cx, cy = line[i, 0], line[i, 1]
     # The circle that touches both legs, as a rational quadratic curve with the weight cos(turn / 2).
     weight = math.cos(0.5 * _turn_at(line, i))
+    needed = min(clearance_at(clearance_m, resolution_m, ix0, iy0, cx, cy), comfort_m) - 0.004
     arc = np.empty((2 * span - 1, 2))
     for j in range(1, 2 * span):
         t = j / (2.0 * span)
         u, v, w = (1.0 - t) * (1.0 - t), 2.0 * t * (1.0 - t) * weight, t * t
         x, y = (u * ax + v * cx + w * bx) / (u + v + w), (u * ay + v * cy + w * by) / (u + v + w)
-        needed = min(clearance_at(clearance_m, resolution_m, ix0, iy0, cx, cy), comfort_m) - 0.004
         if clearance_at(clearance_m, resolution_m, ix0, iy0, x, y) < needed:
             return
         arc[j - 1, 0], arc[j - 1, 1] = x, y

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from planning.coverage_build import lattice_steps
 from planning.footprint import clearance_m
-from planning.grid import FREE, LETHAL, GridSpec
+from planning.grid import DIRECTION_DX, DIRECTION_DY, FREE, LETHAL, GridSpec
 from schemas.base import Message, Pose
 from schemas.contract import SECOND_NS, Outputs, Stage, Topic
 from schemas.operation import FinishReason, MissionPhase, MissionState
@@ -21,7 +20,6 @@ _GRID = GridSpec(0.2, -60, -60, 120, 120)
 _SIZE = 15
 _STEPS = 40
 _PERIOD_NS = SECOND_NS // 10
-_TOWARDS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 
 
 def rehearse(stage: Stage) -> None:
@@ -68,13 +66,7 @@ def _ground(now: int, x_m: float, blocked: bool) -> RiskMap:
     zero = np.zeros(_GRID.shape, np.float32)
     return RiskMap(
         stamp_ns=now,
-        grid=GridHeader(
-            resolution_m=_GRID.resolution_m,
-            ix0=_GRID.ix0,
-            iy0=_GRID.iy0,
-            width=_GRID.width,
-            height=_GRID.height,
-        ),
+        grid=GridHeader(**_GRID._asdict()),
         robot_pose=Pose(x_m=x_m, y_m=0.5),
         footprint_radius_m=0.25,
         state=np.where(solid, LETHAL, FREE).astype(np.uint8),
@@ -91,10 +83,8 @@ def _irm(now: int) -> LocalIrm:
     """All traversable, nothing covered; node (7, 7) in the middle lies at (0.5, 0.5)."""
     half, n = _SIZE // 2, _SIZE * _SIZE
     column, row = np.arange(n) % _SIZE, np.arange(n) // _SIZE
-    edges = np.zeros((n, 8), np.float32)
-    for k, (right, up) in enumerate(_TOWARDS):
-        inside = (column + right >= 0) & (column + right < _SIZE) & (row + up >= 0) & (row + up < _SIZE)
-        edges[inside, k] = math.hypot(right, up)
+    lengths = np.hypot(DIRECTION_DX, DIRECTION_DY)
+    edges = np.where(lattice_steps(_SIZE) >= 0, lengths, 0.0).astype(np.float32)
     return LocalIrm(
         stamp_ns=now, irm_version=1, risk_stamp_ns=now, spacing_m=1.0, ix0=-half, iy0=-half, size=_SIZE,
         robot_pose=Pose(), map_to_odom=Pose(), sensor_range_m=2.0, sensor_fov_rad=2.0, reach=2,

@@ -186,9 +186,7 @@ class RiskMapStage:
         stamp_bumps(layers, s, self._bumps.places(now), self._config.collision_hazard_per_m)
         return RiskMap(
             stamp_ns=stamp_ns,
-            grid=GridHeader(
-                resolution_m=s.resolution_m, ix0=s.ix0, iy0=s.iy0, width=s.width, height=s.height
-            ),
+            grid=GridHeader(**s._asdict()),
             robot_pose=self._pose,
             footprint_radius_m=self._config.footprint_radius_m,
             elevation_m=elevation_m,

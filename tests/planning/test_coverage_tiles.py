@@ -115,7 +115,7 @@ def test_differences_are_those_of_sets(seed: int, size: int) -> None:
     lists, rng = lists_of(lattice, sets), np.random.default_rng(seed)
     to, minus = rng.integers(-1, 5, 12).astype(np.int32), rng.integers(-1, 5, 12).astype(np.int32)
     out = empty_lists(12, 64 * 12)
-    fill_differences(lists, to, minus, entropy, 0, out)
+    fill_differences(lists, to, minus, entropy, out)
     expected = [
         (sets[a] if a >= 0 else frozenset()) - (sets[b] if b >= 0 else frozenset())
         for a, b in zip(to, minus, strict=True)

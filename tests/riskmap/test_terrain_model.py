@@ -232,7 +232,9 @@ def test_supposed_ground_is_no_ceiling_of_itself_either() -> None:
     for over_m, what in ((0.0, FREE), (0.5, LETHAL)):
         model = TerrainModel(config(profile="spot"))
         model.integrate(sparse_cloud(ramp(3.0, 3.9, 8.05, over_m=over_m), 1))
-        assert at(model, cells_of(model)[CEILING_SEEN], 8.05, 0.05) > 0, "taken for something overhead at first"
+        assert at(model, cells_of(model)[CEILING_SEEN], 8.05, 0.05) > 0, (
+            "taken for something overhead at first"
+        )
         for k in range(3):
             model.integrate(sparse_cloud(ramp(*around), k + 2))
         assert at(model, cells_of(model)[SEEN], 8.05, 0.05) == 0, "supposed"
