@@ -177,6 +177,7 @@ def build_model(
     weights: RewardParameters,
     horizon: int,
     rollout_random: float,
+    macros: bool = True,
 ) -> CoverageModel:
     """The model of an episode from the columns of a Local IRM (shapes as in `CoverageModel`)."""
     start = int(root.node[int(np.argmax(root.weight))])
@@ -202,7 +203,7 @@ def build_model(
         np.array(root.node), np.array(root.heading),
         np.array(root.weight), tiles_of_rows(np.array(root.covered), size),
         groups.move, groups.cost, groups.tile, groups.word, horizon, rollout_random,
-        headings > 1, order, most,
+        headings > 1, order, most, macros,
     )  # fmt: skip
 
 

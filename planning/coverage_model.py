@@ -2,7 +2,8 @@
 
 Shared by lcp, reconciler and baselines. State (int64): node, heading, key of the simulation's risk outcomes, moves
 made, then one word a tile of 8 x 8 nodes with the bits of those that this simulation has covered. Actions: 0..7 one
-move in that direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule. Observation:
+move in that direction, 8..15 up to MACRO_STEPS moves in a row, SWEEP a few steps of the informed rule (the last two
+are left out on demand: the paper's plain configuration). Observation:
 blocked or not, and how much was newly covered, binned. Whether an edge is blocked is drawn once a simulation (a hash
 of its key), so that a blocked edge stays blocked and is worth finding out about.
 """
@@ -56,7 +57,8 @@ class CoverageModel(NamedTuple):
     (n, 8, 8), by node, heading and place in that order, the most that such a move can score, 0 when nothing or less.
     Both the sets of steps and the scores hold where the sensor has looked from the node under that heading. That is so
     after every move; of the nodes of the root belief, those from which it has not are `unlooked`, and there the model
-    takes it that nothing has been seen.
+    takes it that nothing has been seen. macros: whether macro actions are offered. rollout_random: share of random
+    moves in rollouts; 1: none by the informed rule.
     """
 
     size: int
@@ -82,6 +84,7 @@ class CoverageModel(NamedTuple):
     looks_on_turn: bool
     move_order: NDArray[np.int32]
     most_score: NDArray[np.float32]
+    macros: bool
 
 
 @njit_borrowing
@@ -297,7 +300,7 @@ def _step(
 
 @njit
 def _actions(model: CoverageModel, state: NDArray[np.int64], actions_out: NDArray[np.int64]) -> int:
-    node, heading, count = state[NODE], state[HEADING], 1
+    node, heading, count = state[NODE], state[HEADING], 1 if model.macros else 0
     actions_out[0] = SWEEP
     for turn in (0, 1, 7, 2, 6, 3, 5, 4):
         k = (heading + turn) % 8
@@ -306,10 +309,22 @@ def _actions(model: CoverageModel, state: NDArray[np.int64], actions_out: NDArra
         actions_out[count] = k
         count += 1
         beyond = model.step_to[node, k]
-        if model.edge_distance_m[beyond, k] > 0.0:
+        if model.macros and model.edge_distance_m[beyond, k] > 0.0:
             actions_out[count] = 8 + k
             count += 1
-    return count if count > 1 else 0
+    return count if count > (1 if model.macros else 0) else 0
+
+
+@njit_borrowing
+def _random_move(model: CoverageModel, node: int, rng: NDArray[np.uint64]) -> int:
+    """A move from a node, all that it has equally likely; -1: it has none."""
+    k, count = -1, 0
+    for direction in range(8):
+        if model.edge_distance_m[node, direction] > 0.0 and model.edge_risk[node, direction] <= MAX_EDGE_RISK:
+            count += 1
+            if random_below(rng, count) == 0:
+                k = direction
+    return k
 
 
 @njit
@@ -321,11 +336,13 @@ def _rollout(
     value, discount, tried, group = 0.0, 1.0, 0, -1
     for _ in range(model.horizon - state[MOVES]):
         k = -1
-        if random_uniform(rng) < model.rollout_random:
+        if model.rollout_random >= 1.0:
+            k = _random_move(model, node, rng)
+        elif random_uniform(rng) < model.rollout_random:
             k, group = np.int64(random_below(rng, 8)), -1  # type: ignore[assignment]
             if model.edge_distance_m[node, k] <= 0.0 or model.edge_risk[node, k] > 0.1:
                 k = -1
-        if k < 0:
+        if k < 0 and model.rollout_random < 1.0:
             k, group = informed_move(model, node, heading, covered, tried, group)
         if k < 0:
             break

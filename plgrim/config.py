@@ -142,6 +142,8 @@ class Config(BaseSettings):
     """Name of the robot: part of every key on the wire."""
     profile: Literal["husky", "spot"] = DEFAULT_PROFILE
     """The robot's body: what the simulator moves and what the planners take it for."""
+    planner: Literal["default", "paper"] = "default"
+    """paper: the paper's plain planners, for comparison (`PAPER`). What a section says itself holds all the same."""
     seed: int = Field(1, ge=0, lt=2**63)
     """The mission's seed; every random stream is derived from it."""
     router: RouterConfig = RouterConfig()
@@ -173,12 +175,14 @@ class Config(BaseSettings):
         return (init_settings, _EnvironmentSource(settings_cls), _FileSource(settings_cls))
 
     def options(self, service: str) -> dict[str, Any]:
-        """The section of a service, with what is said once for all: seed and robot profile; a section may differ.
+        """The section of a service, with what is said once for all: seed, robot, planner; a section may differ.
 
         In a simulated world of rough ground the risk map is one of terrain, the LiDAR looks down at it, irm and
         reconciler keep off what may tip the robot, and irm passes over crumbs.
         """
         section: dict[str, Any] = dict(getattr(self, service))
+        if self.planner == "paper":
+            section = {**PAPER.get(service, {}), **section}
         rough, other = is_rough(self.sim), self.profile != DEFAULT_PROFILE
         if service == "sim":
             section.setdefault("seed", self.seed)
@@ -227,6 +231,14 @@ def is_rough(sim: Mapping[str, Any]) -> bool:
         return False
     return bool(sim.get("mesh_file") or sim.get("dem_file")) or sim.get("world") in ROUGH_WORLDS
 
+
+PAPER: Mapping[str, Mapping[str, Any]] = {
+    "lcp": {"rollout_random": 1.0, "macros": False},
+    "gcp": {"switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0},
+    "reconciler": {"profile": "paper"},
+}
+"""`planner: paper`: uniform rollouts and single moves in the POMCP, the QMDP's best frontier at every step, tau* by
+the literal rule."""
 
 DOWNWARD_LIDAR = {"rings": 24, "elevation_min_deg": -45.0, "elevation_max_deg": 15.0}
 """For rough ground: with the default, no ring meets the ground nearer than 3 m, nor any way down at all."""

@@ -26,6 +26,12 @@ Overlay = Mapping[str, Any]
 
 BUILT_IN_VARIANTS: Mapping[str, Overlay] = {
     "default": {},
+    "paper": {"planner": "paper"},
+    "uniform_rollouts": {"lcp": {"rollout_random": 1.0}},
+    "single_moves": {"lcp": {"macros": False}},
+    "best_frontier": {"gcp": {"switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0}},
+    "orienteering": {"gcp": {"solver": "orienteering"}},
+    "literal_tau": {"reconciler": {"profile": "paper"}},
     "risk_blind": {
         "riskmap": {"risk_blind": True},
         "gcp": {"reward": {"k_risk": 0.0}},
@@ -33,7 +39,8 @@ BUILT_IN_VARIANTS: Mapping[str, Overlay] = {
         "reconciler": {"weights": {"k_risk": 0.0}},
     },
 }
-"""Variants by name that need no file. `risk_blind`: k_rho = 0 in every planner, no CVaR in the risk map."""
+"""Variants by name that need no file. `paper`: the paper's plain planners; those after it: one difference alone, for
+ablation. `risk_blind`: k_rho = 0 in every planner, no CVaR in the risk map."""
 
 _NAME = re.compile(r"[A-Za-z0-9_.+-]{1,64}")
 _FILE_KEYS = ("map_file", "mesh_file", "dem_file")

@@ -55,9 +55,9 @@ def find_frontiers(window: Window, config: Config, least: float | None = None) -
     blocks = _blocks_of(window, config, open_ground, window.ground & ~open_ground, behind, sizes)
     if blocks is None:
         return []
-    gain, hidden = blocks.gain, blocks.hidden
-    hidden *= s.resolution_m**2
-    gain += np.minimum(hidden * LOG_2 / config.spacing_m**2, config.unknown_max_gain)
+    gain, hidden = blocks.gain, blocks.hidden * s.resolution_m**2
+    likely = np.minimum(hidden, blocks.mouth * s.resolution_m * config.opening_depth_m)
+    gain += np.minimum(likely * LOG_2 / config.spacing_m**2, config.unknown_max_gain)
     opening = hidden >= config.opening_min_m2 - 1e-9
     # The most that the least gain can become: an opening left behind is not dropped when the known ground grows.
     gain[opening] = np.maximum(gain[opening], max(least, config.frontier_enough_gain))
@@ -76,10 +76,12 @@ def _find_behind(window: Window, config: Config, least: float) -> list[Found]:
 
 class _Blocks(NamedTuple):
     """Blocks of a border: gain of the ground that counts for each, nats, hidden: the cells that may lie behind it,
-    (b,) each; places: (b, 2) cells; piece_of: (b,), the connected piece it belongs to."""
+    mouth: those of its own cells that border on them, (b,) each; places: (b, 2) cells; piece_of: (b,), the connected
+    piece it belongs to."""
 
     gain: NDArray[np.float64]
     hidden: NDArray[np.float64]
+    mouth: NDArray[np.float64]
     places: NDArray[np.int64]
     piece_of: NDArray[np.int64]
 
@@ -106,12 +108,13 @@ def _blocks_of(
     if blocks == 0:
         return None
     spread_blocks(open_ground, block, round(config.frontier_reach_m / s.resolution_m), blocks)
-    gain, sums, hidden = np.zeros(blocks), np.zeros((blocks, 3)), np.zeros(blocks)
-    block_gains(window.entropy, behind, sizes, block, gain, sums, hidden)
+    gain, sums = np.zeros(blocks), np.zeros((blocks, 3))
+    hidden, mouth = np.zeros(blocks), np.zeros(blocks)
+    block_gains(window.entropy, behind, sizes, block, gain, sums, hidden, mouth)
     places = block_places(window.reachable, block, sums, max(1, round(1.0 / s.resolution_m)))
     piece_of, inside = np.zeros(blocks, np.int64), block >= 0
     piece_of[block[inside]] = labels[inside]
-    return _Blocks(gain, hidden, places, piece_of)
+    return _Blocks(gain, hidden, mouth, places, piece_of)
 
 
 def near_robot(window: Window, range_m: float) -> NDArray[np.bool_]:
@@ -247,8 +250,10 @@ def block_gains(
     gain: NDArray[np.float64],
     sums: NDArray[np.float64],
     hidden: NDArray[np.float64],
+    mouth: NDArray[np.float64],
 ) -> None:
-    """Entropy of each block's cells, and the size of the largest piece of hopeful ground that they border on (hidden).
+    """Entropy of each block's cells, the size of the largest piece of hopeful ground that they border on (hidden), and
+    how many of them do (mouth).
 
     behind: (h, w) labels of the pieces of hopeful ground, 0 elsewhere. sizes: cells of piece k + 1. sums: (blocks, 3):
     number of cells, sum of rows, sum of columns.
@@ -263,10 +268,13 @@ def block_gains(
             sums[b, 0] += 1.0
             sums[b, 1] += row
             sums[b, 2] += column
+            opens = 0
             for d_row, d_column in ((0, 1), (1, 0), (0, -1), (-1, 0)):
                 r, c = row + d_row, column + d_column
                 if r >= 0 and c >= 0 and r < height and c < width and behind[r, c] > 0:
                     hidden[b] = max(hidden[b], float(sizes[behind[r, c] - 1]))
+                    opens = 1
+            mouth[b] += opens
 
 
 @njit

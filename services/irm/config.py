@@ -116,8 +116,11 @@ class Config(BaseModel):
     opening_rounds: int = Field(
         3, ge=1, le=100, description="Seen in fewer rounds and gone again, such a border never was one."
     )
+    opening_depth_m: float = Field(
+        4.0, ge=0, le=100, description="Behind each metre of such a border so much ground is expected, m, but"
+    )
     unknown_max_gain: float = Field(
-        3.0, ge=0, le=1000, description="Most that the unknown adds to a frontier, nats."
+        12.0, ge=0, le=1000, description="this is the most that the unknown adds to a frontier, nats."
     )
     give_up_s: float = Field(6.0, gt=0, le=600, description="Time beside a frontier that yields nothing, s.")
     pursue_s: float = Field(

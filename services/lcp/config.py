@@ -105,7 +105,10 @@ class Config(BaseModel):
     horizon: int = Field(
         40, ge=1, le=500, description="Moves of every simulation, tree and rollout together."
     )
-    rollout_random: float = Field(0.1, ge=0, le=1, description="Share of random moves in rollouts.")
+    rollout_random: float = Field(
+        0.1, ge=0, le=1, description="Share of random moves in rollouts; 1: uniform, none by the informed rule."
+    )
+    macros: bool = Field(True, description="Whether the tree has macro actions beside single moves.")
     path_steps: int = Field(
         24, ge=1, le=500, description="Moves of the path that is given to the reconciler."
     )

@@ -108,4 +108,5 @@ def coverage_model(
         weights=parameters(config.weights),
         horizon=config.horizon,
         rollout_random=config.rollout_random,
+        macros=config.macros,
     )

@@ -28,6 +28,7 @@ CONFIG = Config(
     frontier_block_m=2.0,
     frontier_reach_m=3.0,
     frontier_min_gain=0.3,
+    opening_depth_m=1.2,
     unknown_max_gain=1.5,
     opening_min_m2=0.6,
     opening_range_m=7.0,
@@ -176,6 +177,11 @@ def _brute_hidden(window: Window, cells: NDArray[np.bool_]) -> float:
     return max(sizes, default=0) * RES**2
 
 
+def _brute_mouth_m(window: Window, cells: NDArray[np.bool_]) -> float:
+    """Width of these cells that has a side in common with hopeful ground, m."""
+    return float((cells & ndimage.binary_dilation(window.hopeful, CROSS)).sum()) * RES
+
+
 def _gains(
     window: Window, openings: bool = True
 ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.int32]]:
@@ -183,9 +189,10 @@ def _gains(
     block, blocks, labels = blocks_of(window, CONFIG)
     spread_blocks(open_of(window), block, round(CONFIG.frontier_reach_m / RES), blocks)
     hidden = [_brute_hidden(window, block == b) for b in range(blocks)]
+    likely = [min(hidden[b], CONFIG.opening_depth_m * _brute_mouth_m(window, block == b)) for b in range(blocks)]
     gains = [
         float(window.entropy[block == b].sum(dtype=np.float64))
-        + min(LOG_2 * hidden[b], CONFIG.unknown_max_gain)
+        + min(LOG_2 * likely[b], CONFIG.unknown_max_gain)
         for b in range(blocks)
     ]
     for b in range(blocks):
@@ -198,9 +205,11 @@ def _gains(
 def test_a_gain_is_the_entropy_of_its_cells_and_of_the_unseen_beside_them(seed: int) -> None:
     window = random_window(seed)
     block, gains, _ = _gains(window, openings=False)
-    gain, hidden, sums = np.zeros(len(gains)), np.zeros(len(gains)), np.zeros((len(gains), 3))
-    block_gains(window.entropy, *_behind(window), block, gain, sums, hidden)
-    behind = np.minimum(hidden * RES**2 * LOG_2, CONFIG.unknown_max_gain)
+    gain, sums = np.zeros(len(gains)), np.zeros((len(gains), 3))
+    hidden, mouth = np.zeros(len(gains)), np.zeros(len(gains))
+    block_gains(window.entropy, *_behind(window), block, gain, sums, hidden, mouth)
+    likely = np.minimum(hidden * RES**2, mouth * RES * CONFIG.opening_depth_m)
+    behind = np.minimum(likely * LOG_2, CONFIG.unknown_max_gain)
     assert gain + behind == pytest.approx(gains, abs=1e-6)
     for b in range(len(gains)):
         cells = np.argwhere(block == b)
@@ -212,8 +221,9 @@ def test_a_gain_is_the_entropy_of_its_cells_and_of_the_unseen_beside_them(seed: 
 def test_a_place_can_be_reached_near_its_block_and_is_best_for_it(seed: int) -> None:
     window = random_window(seed)
     block, gains, _ = _gains(window)
+    gain, hidden, mouth = np.zeros((3, len(gains)))
     sums = np.zeros((len(gains), 3))
-    block_gains(window.entropy, *_behind(window), block, np.zeros(len(gains)), sums, np.zeros(len(gains)))
+    block_gains(window.entropy, *_behind(window), block, gain, sums, hidden, mouth)
     reach = 2
     places = block_places(window.reachable, block, sums, reach)
     free = np.argwhere(window.reachable)

@@ -123,6 +123,7 @@ class Reference:
         covered: Iterable[int] = (),
         horizon: int = 40,
         rollout_random: float = 0.0,
+        macros: bool = True,
     ) -> CoverageModel:
         """The compiled model of this problem."""
         n = self.size**2
@@ -144,6 +145,7 @@ class Reference:
             weights=parameters(self.weights),
             horizon=horizon,
             rollout_random=rollout_random,
+            macros=macros,
         )
 
     def visible(self) -> NDArray[np.uint32]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from planning.coverage_build import reachable_entropy
 from planning.coverage_groups import best_viewpoint
 from planning.coverage_model import (
+    ACTIONS,
     BITS,
     HEADING,
     KEY,
@@ -455,6 +456,34 @@ def test_rollouts_with_chance_stay_on_edges() -> None:
         ends.add(int(state[NODE]))
     assert ends <= within
     assert len(ends) > 5
+
+
+def test_uniform_rollouts_take_every_edge_equally_often() -> None:
+    """`rollout_random=1`, the paper's plain rollouts: the ends of one move, against equal shares."""
+    lattice = random_lattice(9, 6, 1, wall_share=0.2, risky_share=0.0)
+    start = max({node for node, _ in lattice.edges}, key=lambda node: len(list(lattice.directions(node))))
+    ways = list(lattice.directions(start))
+    model = lattice.model(start, horizon=1, rollout_random=1.0)
+    rng, ends = random_stream(4), dict.fromkeys((lattice.neighbour(start, k) for k in ways), 0)
+    draws = 4000
+    for _ in range(draws):
+        state = state_at(lattice, start, 0, 1, frozenset())
+        _rollout(model, state, 1, rng)
+        ends[int(state[NODE])] += 1
+    deviation = math.sqrt(draws / len(ways))
+    assert len(ways) >= 4
+    assert all(abs(n - draws / len(ways)) < 5 * deviation for n in ends.values())
+
+
+@settings(max_examples=50)
+@given(SEEDS)
+def test_without_macros_the_actions_are_the_moves_there_are(seed: int) -> None:
+    lattice = random_lattice(seed, 6, 1, wall_share=0.4, risky_share=0.3)
+    model, out = lattice.model(macros=False), np.zeros(ACTIONS, np.int64)
+    for node in {node for node, _ in lattice.edges}:
+        count = _actions(model, state_at(lattice, node, 3, 1, frozenset()), out)
+        open_ways = [k for k in lattice.directions(node) if lattice.edges[node, k].risk <= MAX_EDGE_RISK]
+        assert sorted(out[:count].tolist()) == sorted(open_ways)
 
 
 def best_by_sets(

@@ -174,3 +174,18 @@ def test_the_environment_names_the_robots_profile(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("PLGRIM_PROFIL", "husky")
     with pytest.raises(ConfigError, match="PLGRIM_PROFILE"):
         load_config(None, {})
+
+
+def test_the_papers_plain_planners_have_a_name_and_a_section_still_wins() -> None:
+    from services.gcp.config import Config as Gcp
+    from services.lcp.config import Config as Lcp
+    from services.reconciler.config import Config as Reconciler
+
+    config = load_config(None, {"planner": "paper", "sim": {"world": "cave"}, "lcp": {"macros": True}})
+    lcp, gcp = Lcp.model_validate(config.options("lcp")), Gcp.model_validate(config.options("gcp"))
+    assert (lcp.rollout_random, lcp.macros) == (1.0, True)
+    assert (gcp.solver, gcp.switch_margin, gcp.switch_margin_relative) == ("qmdp", 0.0, 0.0)
+    assert Reconciler.model_validate(config.options("reconciler")).profile == "paper"
+    plain = load_config(None, {})
+    assert Lcp.model_validate(plain.options("lcp")) == Lcp()
+    assert Gcp.model_validate(plain.options("gcp")) == Gcp()
