@@ -106,7 +106,10 @@ class Config(BaseModel):
         40, ge=1, le=500, description="Moves of every simulation, tree and rollout together."
     )
     rollout_random: float = Field(
-        0.1, ge=0, le=1, description="Share of random moves in rollouts; 1: uniform, none by the informed rule."
+        0.1,
+        ge=0,
+        le=1,
+        description="Share of random moves in rollouts; 1: uniform, none by the informed rule.",
     )
     macros: bool = Field(True, description="Whether the tree has macro actions beside single moves.")
     path_steps: int = Field(

@@ -189,7 +189,9 @@ def _gains(
     block, blocks, labels = blocks_of(window, CONFIG)
     spread_blocks(open_of(window), block, round(CONFIG.frontier_reach_m / RES), blocks)
     hidden = [_brute_hidden(window, block == b) for b in range(blocks)]
-    likely = [min(hidden[b], CONFIG.opening_depth_m * _brute_mouth_m(window, block == b)) for b in range(blocks)]
+    likely = [
+        min(hidden[b], CONFIG.opening_depth_m * _brute_mouth_m(window, block == b)) for b in range(blocks)
+    ]
     gains = [
         float(window.entropy[block == b].sum(dtype=np.float64))
         + min(LOG_2 * likely[b], CONFIG.unknown_max_gain)
