@@ -34,8 +34,8 @@ CERTIFICATE, KEY, TRUSTED = "cert.pem", "key.pem", "trusted.pem"
 _CA, _CA_KEY, _INDEX = "ca.pem", "ca.key", "issued.json"
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,32}(\.[A-Za-z0-9_-]{1,32}){0,3}")
 _NOT_BEFORE = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
-"""A robot without a battery-backed clock may start at zero, and its processes must find one another all the same. That a
-certificate has begun protects nothing: what bounds it are its end and `trusted.pem`."""
+"""A robot without a battery-backed clock may start at zero, and its processes must find one another all the same. That
+a certificate has begun protects nothing: what bounds it are its end and `trusted.pem`."""
 
 
 class CertificateError(ConfigError):

@@ -60,8 +60,8 @@ def check_listen(host: str, config: Config) -> None:
     """Refuse an address for a server without TLS and tokens that others can reach. Raises ExposedError."""
     if not (is_loopback(host) or config.deployment.private_network):
         raise ExposedError(
-            f"--host {host}: can be reached from other hosts, and there is neither TLS nor a token: whoever comes reads "
-            "maps and plans. Stay on 127.0.0.1; from another computer: ssh -L 8765:127.0.0.1:8765 HOST"
+            f"--host {host}: can be reached from other hosts, and there is neither TLS nor a token: whoever comes "
+            "reads maps and plans. Stay on 127.0.0.1; from another computer: ssh -L 8765:127.0.0.1:8765 HOST"
         )
 
 

@@ -1,9 +1,10 @@
 """Who may ask the status service for what: bearer tokens with roles, and where it may listen.
 
 Reading is open on a loopback address and in a network without strangers (`trusted_network`), unless `read_token` is
-`always`, and needs a token elsewhere; every request that changes something needs the token of an operator, everywhere. A browser hands its token in once, in the header of
-`POST /api/v1/session`, and then carries it in a cookie that no script can read: pictures, event streams and WebSockets
-cannot send headers. What a request may look like before anybody reads it is in `guard.py`.
+`always`, and needs a token elsewhere; every request that changes something needs the token of an operator,
+everywhere. A browser hands its token in once, in the header of `POST /api/v1/session`, and then carries it in a
+cookie that no script can read: pictures, event streams and WebSockets cannot send headers. What a request may look
+like before anybody reads it is in `guard.py`.
 
 A route is protected by a dependency; an application without `secure` refuses all of them:
 

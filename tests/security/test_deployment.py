@@ -171,6 +171,15 @@ def test_journals_outlive_a_boot_wherever_they_are_kept(
             assert config.runtime.state_dir and config.clock.source == "realtime", name
 
 
+def test_what_hangs_is_replaced_where_no_supervisor_watches() -> None:
+    for unit in ("plgrim@.service", "plgrim-link.service"):
+        text = (ROOT / "deploy" / "systemd" / unit).read_text(encoding="utf-8")
+        assert "Type=notify\n" in text and "WatchdogSec=8\n" in text and "StartLimitBurst=6\n" in text, unit
+    for file in COMPOSE.values():
+        for name, service in yaml.safe_load(file.read_text(encoding="utf-8"))["services"].items():
+            assert service["environment"]["PLGRIM_RUNTIME__WATCHDOG"] == "true", f"{file.name}: {name}"
+
+
 def test_systemd_units_are_confined() -> None:
     for unit in (ROOT / "deploy" / "systemd").glob("*.service"):
         text = unit.read_text(encoding="utf-8")
