@@ -3,24 +3,12 @@
 from __future__ import annotations
 
 import socket
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from plgrim.config import Config
-from tests.runtime.helpers import FAKES, eventually
-
-
-@pytest.fixture
-def router(config: Config) -> Iterator[None]:
-    """A router in a process of its own."""
-    process = subprocess.Popen([sys.executable, str(FAKES), "router"])
-    yield
-    process.terminate()
-    process.wait(20.0)
+from tests.runtime.helpers import FAKES, Start, eventually
 
 
 @pytest.fixture
@@ -43,22 +31,16 @@ def told(ear: socket.socket) -> list[str]:
             return found
 
 
-def start(behaviour: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, str(FAKES), "mission", behaviour], stderr=subprocess.PIPE, text=True
-    )
-
-
 @pytest.mark.parametrize("behaviour", ["loops", "locks"])
 @pytest.mark.usefixtures("router")
 def test_what_hangs_is_silent_and_ends_itself(
-    behaviour: str, systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
+    behaviour: str, systemd: socket.socket, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also one that holds Python's lock: nothing of Python can run in it any more."""
     monkeypatch.setenv("PLGRIM_RUNTIME__WATCHDOG", "true")
     monkeypatch.setenv("PLGRIM_RUNTIME__STUCK_AFTER_S", "2")
-    with start(behaviour) as process:
-        _, said = process.communicate(timeout=120.0)
+    process = start(str(FAKES), "mission", behaviour)
+    said, _ = process.communicate(timeout=120.0)
     assert process.returncode == 1
     assert "Timeout" in said and "in step" in said, said  # where it hung
     heard = told(systemd)
@@ -68,7 +50,7 @@ def test_what_hangs_is_silent_and_ends_itself(
 
 @pytest.mark.usefixtures("router")
 def test_what_steps_says_so_and_ends_when_it_is_told(
-    systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
+    systemd: socket.socket, start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PLGRIM_RUNTIME__WATCHDOG", "true")
     monkeypatch.setenv("PLGRIM_RUNTIME__STUCK_AFTER_S", "2")
@@ -78,10 +60,11 @@ def test_what_steps_says_so_and_ends_when_it_is_told(
         heard.extend(told(systemd))
         return heard.count("WATCHDOG=1") > 50  # over five seconds
 
-    with start("idle") as process:
-        eventually(said_often, "it says that it steps")
-        assert process.poll() is None
-        process.terminate()
-        process.communicate(timeout=20.0)
+    process = start(str(FAKES), "mission", "idle")
+    eventually(lambda: told(systemd), "it is ready", within_s=120.0)
+    eventually(said_often, "it says that it steps", within_s=60.0)
+    assert process.poll() is None
+    process.terminate()
+    process.communicate(timeout=20.0)
     assert process.returncode == 0
     assert told(systemd)[-1] == "STOPPING=1"
