@@ -2,8 +2,9 @@
 
 After FIG-OP (Peltzer et al. 2022, arXiv 2203.06316): the QMDP weighs each frontier as if it were the only goal, and
 drives by a small opening on the way to a large one far away, to come back for it later. Here the order of the visits
-counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the paper's cost
-of a leg.
+counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the risk's part
+of the paper's cost of a leg. The way itself counts by what it delays: all is to be visited, and a discounted cost of the
+way would be a reason to put off the long leg, for whatever crumb is nearer.
 """
 
 from __future__ import annotations
@@ -34,25 +35,30 @@ class Groups(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """Legs of a tour: cost, discount (gamma^distance), (k + 1, k): row k from the robot. inf and 0 without a way."""
+    """Legs of a tour: cost (of risk), discount (gamma^distance), way: what the distance itself costs, (k + 1, k): row k
+    from the robot. inf, 0 and 0 without a way.
+    """
 
     cost: Floats
     discount: Floats
+    way: Floats
 
 
 class Tour(NamedTuple):
-    """An order of the groups and its value; empty when none can be reached."""
+    """An order of the groups and its value, and less what the way costs: net; empty when none can be reached."""
 
     order: NDArray[np.int64]
     value: float
+    net: float = -np.inf
 
 
 class Outlook(NamedTuple):
-    """Where the best tour begins: slot of a frontier (-1: no tour), its value, and that of the best tour that begins
-    with the frontier held (-inf: none)."""
+    """Where the best tour begins: slot of a frontier (-1: no tour), its value, net: less the way's cost too, and the value
+    of the best tour that begins with the frontier held (-inf: none)."""
 
     first: int = -1
     value: float = -np.inf
+    net: float = -np.inf
     kept_value: float = -np.inf
 
 
@@ -172,13 +178,13 @@ def best_tour(gain: Floats, legs: Legs, first: int = -1) -> Tour:
 
     By local search (moves of single stops, turns of stretches) from the greedy order.
     """
-    cost, discount = legs
+    cost, discount, way = legs
     reached = np.isfinite(cost[-1])
     if not reached.any() or (first >= 0 and not reached[first]):
         return Tour(np.zeros(0, np.int64), -np.inf)
     order = _greedy(first, reached, gain, cost, discount)
     value = improve(order, 1 if first >= 0 else 0, gain, cost, discount)
-    return Tour(order, float(value))
+    return Tour(order, float(value), float(tour_value(order, gain, cost + way, discount)))
 
 
 def group_frontiers(
@@ -249,7 +255,7 @@ class Visits:
             return Outlook()
         away, _ = self._ways(start, frontiers)
         outlook = self._over(start, held, frontiers, away, 0)
-        if outlook.value < self._near_worth:
+        if outlook.net < self._near_worth:
             outlook = self._over(start, held, frontiers, away, self._most)
         return outlook
 
@@ -269,7 +275,7 @@ class Visits:
         )
         if kept.value > tour.value:  # the search of the free tour ended in a worse place
             tour = kept
-        return Outlook(int(groups.slot[tour.order[0]]), tour.value, kept.value)
+        return Outlook(int(groups.slot[tour.order[0]]), tour.value, tour.net, kept.value)
 
     def _ways(self, source: int, targets: Slots) -> tuple[Floats, Floats]:
         net = self._roads.net
@@ -280,8 +286,12 @@ class Visits:
         return cost[targets], distance_m[targets]
 
     def _legs(self, start: int, stops: Slots) -> Legs:
-        cost, discount = np.full((stops.size + 1, stops.size), np.inf), np.zeros((stops.size + 1, stops.size))
+        shape, w = (stops.size + 1, stops.size), self._roads.weights
+        cost, discount, way = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
         for row, source in enumerate([*stops.tolist(), start]):
-            cost[row], distance_m = self._ways(source, stops)
-            discount[row] = self._gamma**distance_m
-        return Legs(cost, discount)
+            total, distance_m = self._ways(source, stops)
+            reached = np.isfinite(total)
+            way[row, reached] = w.k_cost * w.k_distance_per_m * distance_m[reached]
+            cost[row, reached] = np.maximum(total - way[row], 0.0)[reached]
+            discount[row, reached] = self._gamma ** distance_m[reached]
+        return Legs(cost, discount, way)
