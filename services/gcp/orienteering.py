@@ -2,9 +2,9 @@
 
 After FIG-OP (Peltzer et al. 2022, arXiv 2203.06316): the QMDP weighs each frontier as if it were the only goal, and
 drives by a small opening on the way to a large one far away, to come back for it later. Here the order of the visits
-counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the risk's part
-of the paper's cost of a leg. The way itself counts by what it delays: all is to be visited, and a discounted cost of the
-way would be a reason to put off the long leg, for whatever crumb is nearer.
+counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the part of risk
+in the paper's cost of a leg. The way itself counts by what it delays: all is to be visited, and a discounted cost of
+the way would be a reason to put off the long leg, for whatever crumb is nearer.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Tour(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """Where the best tour begins: slot of a frontier (-1: no tour), its value, net: less the way's cost too, and the value
-    of the best tour that begins with the frontier held (-inf: none)."""
+    """Where the best tour begins: slot of a frontier (-1: no tour), its value, net: less the way's cost too, and the
+    value of the best tour that begins with the frontier held (-inf: none)."""
 
     first: int = -1
     value: float = -np.inf
