@@ -92,6 +92,7 @@ class Roadmap:
         self.next_id = self.manager.update(
             window, (x_m, y_m), now_ns, elapsed_s, self.next_id, ground_m2, anchor, doubtful
         )
+        self._back += self.manager.take_back()
         self._doubtful = doubtful
         search = Search(window)
         search.run(window.robot_cell, 3.0 * self.config.max_edge_m)
@@ -144,7 +145,10 @@ class Roadmap:
         for node in [n for n in self._back if n in self.graph]:
             x, y = self.road.place(node)
             z = self.graph.nodes[node]["z"]
-            for _, other in self._near(x, y, z, 3.0 * self.config.max_edge_m, BREADCRUMB)[:3]:
+            # Of a place in doubt: to what is in doubt as well, which was seen on the same way.
+            certain, reach_m = self._is_certain(node), 3.0 * self.config.max_edge_m
+            around = self.road.near(x, y, z, reach_m, BREADCRUMB)
+            for other in [n for _, n in around if self._is_certain(n) == certain][:3]:
                 straight = max(self.road.straight_m(node, other), 1e-3)
                 if not self._is_fenced(node, other):
                     self.road.set_edge(node, other, _GUESSED_TIMES * straight, _GUESSED_RISK, 0)
