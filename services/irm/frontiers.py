@@ -250,7 +250,8 @@ class FrontierManager:
 
     def _drop_expired(self, x_m: float, y_m: float, now_ns: int) -> bool:
         """A frontier was found here: what was given up here is that one. Returns whether there was any."""
-        here = [g for g in self.given_up if g.until_ns <= now_ns and self._is_at(g, x_m, y_m)]
+        expired, same_m = [g for g in self.given_up if g.until_ns <= now_ns], self.config.frontier_same_m
+        here = [g for g in expired if math.hypot(g.x_m - x_m, g.y_m - y_m) <= same_m]
         self.given_up = [g for g in self.given_up if g not in here]
         return bool(here)
 
@@ -328,10 +329,8 @@ class FrontierManager:
         return sorted(pairs)
 
     def _is_given_up(self, x_m: float, y_m: float, now_ns: int) -> bool:
-        return any(g.until_ns > now_ns and self._is_at(g, x_m, y_m) for g in self.given_up)
-
-    def _is_at(self, g: GivenUp, x_m: float, y_m: float) -> bool:
-        return math.hypot(g.x_m - x_m, g.y_m - y_m) < 0.7 * self.config.give_up_radius_m
+        held, near = [g for g in self.given_up if g.until_ns > now_ns], 0.7 * self.config.give_up_radius_m
+        return any(math.hypot(g.x_m - x_m, g.y_m - y_m) < near for g in held)
 
     def _watch(self, window: Window, robot: tuple[float, float], now_ns: int, elapsed_s: float) -> None:
         """Give up frontiers beside which the robot has been for long and that yield nothing."""
