@@ -256,11 +256,17 @@ class Roadmap:
             # Riskier than thought, perhaps, but it leads there: the robot must not be cut off from where it came from.
             self.road.set_edge(a, b, self._climbed_m(a, b, d), min(rho, _MOST_RISK), 1)
             return True
+        if d >= self.config.max_edge_m and not held["driven"] and self._may_lead(place, target, search):
+            return False
         # No way within the window is no evidence against a way that the robot has driven: it may lead around outside.
         misplaced = search.is_lethal(*place) or search.is_lethal(*target)
         if not held["driven"] or (not misplaced and self._is_refuted(a, b, search)):
             self.road.drop_edge(a, b)
         return False
+
+    def _may_lead(self, start: tuple[float, float], end: tuple[float, float], search: Search) -> bool:
+        """Whether a way may lead over what the risk map has forgotten, at the start or between: no evidence."""
+        return not search.knows(*start) or search.remembered_m(*end) < self.config.max_edge_m
 
     def _is_refuted(self, a: int, b: int, search: Search) -> bool:
         """Whether something stands, time after time, where the robot went from a to b."""
