@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from planning.frames import Planar
 from planning.grid import GridSpec, overlap, window_around
@@ -28,7 +29,7 @@ def drive(keyframes: int) -> GroundStore:
 
 def everything(
     store: GroundStore, spec: GridSpec, frame: Planar
-) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
+) -> NDArray[np.uint8]:
     """What a window shows, by going through all patches."""
     out = np.zeros(spec.shape, np.uint8)
     for patch in sorted(store._patches.values(), key=lambda p: p.turn):
