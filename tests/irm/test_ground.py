@@ -27,9 +27,7 @@ def drive(keyframes: int) -> GroundStore:
     return store
 
 
-def everything(
-    store: GroundStore, spec: GridSpec, frame: Planar
-) -> NDArray[np.uint8]:
+def everything(store: GroundStore, spec: GridSpec, frame: Planar) -> NDArray[np.uint8]:
     """What a window shows, by going through all patches."""
     out = np.zeros(spec.shape, np.uint8)
     for patch in sorted(store._patches.values(), key=lambda p: p.turn):
