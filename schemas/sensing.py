@@ -64,7 +64,8 @@ class Odometry(Message):
 class PoseGraph(Message):
     """SLAM's keyframes, all of them. revision changes when a loop closure has moved keyframes.
 
-    keyframe_id: (n,) increasing, each once: readers bisect it. pose_in_map: (n, 4) x, y, z, yaw. covariance: (n, 3) variances of x, y, yaw.
+    keyframe_id: (n,) increasing, each once: readers bisect it. pose_in_map: (n, 4) x, y, z, yaw. covariance: (n, 3)
+    variances of x, y, yaw.
     """
 
     schema_name: ClassVar[str] = "pose_graph"

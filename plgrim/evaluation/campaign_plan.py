@@ -43,8 +43,8 @@ BUILT_IN_VARIANTS: Mapping[str, Overlay] = {
 }
 """Variants by name that need no file. `paper`: the paper's plain planners; those after it: one difference alone, for
 ablation. `risk_neutral`: k_rho = 0 in every planner, the mean instead of CVaR in the risk map; what is lethal stays so.
-`risk_blind`: the same, and the risk map leaves out slope, step, roughness and drop, lethal ones too, and obstacles below
-the knee."""
+`risk_blind`: the same, and the risk map leaves out slope, step, roughness and drop, lethal ones too, and obstacles
+below the knee."""
 
 _NAME = re.compile(r"[A-Za-z0-9_.+-]{1,64}")
 _FILE_KEYS = ("map_file", "mesh_file", "dem_file")

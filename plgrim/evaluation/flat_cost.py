@@ -3,8 +3,8 @@
 The real stages, one after the other as in lock-step, in a network of tunnels that a robot drives through at 1 m/s by
 depth-first search; risk maps and looks come from the plan of the tunnels. The cost of a step is CPU time of its thread,
 so that other processes on the machine do not count; that of a message is its size on the wire. Nothing may grow with
-what has been driven. Only steps over new ground are compared: how often the search turns back differs from one kilometre
-to another, and the way back out of a dead end costs less.
+what has been driven. Only steps over new ground are compared: how often the search turns back differs from one
+kilometre to another, and the way back out of a dead end costs less.
 """
 
 from __future__ import annotations

@@ -145,7 +145,7 @@ class Config(BaseModel):
     max_clearance_m: float = Field(1.5, gt=0.3, le=5, description="Clearance is measured up to this, m.")
     risk_blind: bool = Field(
         False,
-        description="Experiments only: terrain is neither hazard nor lethal, only what is above the knee is an obstacle, "
+        description="Experiments only: terrain is neither hazard nor lethal, only what is above the knee an obstacle; "
         "no CVaR.",
     )
     knee_height_m: float = Field(

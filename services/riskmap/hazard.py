@@ -69,9 +69,8 @@ def hazard_layers(
     state = np.full(shape, UNKNOWN, dtype=np.uint8)
     mean, variance = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
     _combine(metrics, obstacles, limits, state, mean, variance)
-    cvar = np.minimum(
-        mean + np.float32(cvar_factor(alpha)) * np.sqrt(variance), np.float32(limits.full_hazard_per_m)
-    )
+    factor = cvar_factor(alpha) if alpha > 0.0 else 0.0
+    cvar = np.minimum(mean + np.float32(factor) * np.sqrt(variance), np.float32(limits.full_hazard_per_m))
     clearance = np.full(shape, max_clearance_m, dtype=np.float32)
     stamp_clearance(
         state == LETHAL, obstacles.hit_x, obstacles.hit_y, resolution_m, max_clearance_m, clearance

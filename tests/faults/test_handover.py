@@ -1,4 +1,4 @@
-"""What the observer of the fault suite says of a restarted irm, with graphs made for the purpose: no process, no kill."""
+"""What the observer of the fault suite says of a restarted irm, with graphs made for the purpose: nothing is killed."""
 
 from __future__ import annotations
 
