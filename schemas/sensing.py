@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+import numpy as np
+from pydantic import Field, model_validator
 
 from schemas.base import Array, F32Points, Message, Pose, column
+from schemas.errors import ValueRangeError
 
 
 class PointCloud(Message):
@@ -62,7 +64,8 @@ class Odometry(Message):
 class PoseGraph(Message):
     """SLAM's keyframes, all of them. revision changes when a loop closure has moved keyframes.
 
-    keyframe_id: (n,) increasing. pose_in_map: (n, 4) x, y, z, yaw. covariance: (n, 3) variances of x, y, yaw.
+    keyframe_id: (n,) increasing, each once: readers bisect it. pose_in_map: (n, 4) x, y, z, yaw. covariance: (n, 3)
+    variances of x, y, yaw.
     """
 
     schema_name: ClassVar[str] = "pose_graph"
@@ -71,6 +74,17 @@ class PoseGraph(Message):
     keyframe_id: Annotated[Array, column("int64", "n", minimum=0)]
     pose_in_map: Annotated[Array, column("float64", "n", 4)]
     covariance: Annotated[Array, column("float64", "n", 3, minimum=0)]
+
+    @model_validator(mode="after")
+    def _check_ids(self) -> PoseGraph:
+        ids = self.keyframe_id
+        wrong = np.flatnonzero(ids[1:] <= ids[:-1])
+        if wrong.size:
+            at = int(wrong[0]) + 1
+            raise ValueRangeError(
+                f"pose_graph.keyframe_id: entry {at} is {ids[at]} after {ids[at - 1]}; ids must increase"
+            )
+        return self
 
 
 class CoverageScan(Message):

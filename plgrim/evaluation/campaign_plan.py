@@ -24,23 +24,29 @@ from plgrim.registry import STAGES
 
 Overlay = Mapping[str, Any]
 
+_NO_K_RISK: Overlay = {
+    "gcp": {"reward": {"k_risk": 0.0}},
+    "lcp": {"weights": {"k_risk": 0.0}},
+    "reconciler": {"weights": {"k_risk": 0.0}},
+}
+
 BUILT_IN_VARIANTS: Mapping[str, Overlay] = {
     "default": {},
     "paper": {"planner": "paper"},
     "uniform_rollouts": {"lcp": {"rollout_random": 1.0}},
     "single_moves": {"lcp": {"macros": False}},
-    "best_frontier": {"gcp": {"switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0}},
-    "orienteering": {"gcp": {"solver": "orienteering"}},
-    "literal_tau": {"reconciler": {"profile": "paper"}},
-    "risk_blind": {
-        "riskmap": {"risk_blind": True},
-        "gcp": {"reward": {"k_risk": 0.0}},
-        "lcp": {"weights": {"k_risk": 0.0}},
-        "reconciler": {"weights": {"k_risk": 0.0}},
+    "best_frontier": {
+        "gcp": {"solver": "qmdp", "switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0}
     },
+    "qmdp": {"gcp": {"solver": "qmdp"}},
+    "literal_tau": {"reconciler": {"profile": "paper"}},
+    "risk_neutral": {"riskmap": {"cvar_alpha": 0.0}, **_NO_K_RISK},
+    "risk_blind": {"riskmap": {"risk_blind": True}, **_NO_K_RISK},
 }
 """Variants by name that need no file. `paper`: the paper's plain planners; those after it: one difference alone, for
-ablation. `risk_blind`: k_rho = 0 in every planner, no CVaR in the risk map."""
+ablation. `risk_neutral`: k_rho = 0 in every planner, the mean instead of CVaR in the risk map; what is lethal stays so.
+`risk_blind`: the same, and the risk map leaves out slope, step, roughness and drop, lethal ones too, and obstacles
+below the knee."""
 
 _NAME = re.compile(r"[A-Za-z0-9_.+-]{1,64}")
 _FILE_KEYS = ("map_file", "mesh_file", "dem_file")

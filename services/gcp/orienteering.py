@@ -2,8 +2,9 @@
 
 After FIG-OP (Peltzer et al. 2022, arXiv 2203.06316): the QMDP weighs each frontier as if it were the only goal, and
 drives by a small opening on the way to a large one far away, to come back for it later. Here the order of the visits
-counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the paper's cost
-of a leg.
+counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the part of risk
+in the paper's cost of a leg. The way itself counts by what it delays: all is to be visited, and a discounted cost of
+the way would be a reason to put off the long leg, for whatever crumb is nearer.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from services.gcp.roadnet import RoadNet
 
 _NEXT_OF_GROUP = 0.3
 """Frontiers of a group mostly look at the same unseen ground: the best one counts whole, the others so much."""
+_NEAR_COST = 0.5
+"""Ways that cost less are equally near when gain is weighed by cost, nats: ten metres."""
 
 
 class Groups(NamedTuple):
@@ -32,25 +35,30 @@ class Groups(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """Legs of a tour: cost, discount (gamma^distance), (k + 1, k): row k from the robot. inf and 0 without a way."""
+    """Legs of a tour: cost (of risk), discount (gamma^distance), way: what the distance itself costs, (k + 1, k): row k
+    from the robot. inf, 0 and 0 without a way.
+    """
 
     cost: Floats
     discount: Floats
+    way: Floats
 
 
 class Tour(NamedTuple):
-    """An order of the groups and its value; empty when none can be reached."""
+    """An order of the groups and its value, and less what the way costs: net; empty when none can be reached."""
 
     order: NDArray[np.int64]
     value: float
+    net: float = -np.inf
 
 
 class Outlook(NamedTuple):
-    """Where the best tour begins: slot of a frontier (-1: no tour), its value, and that of the best tour that begins
-    with the frontier held (-inf: none)."""
+    """Where the best tour begins: slot of a frontier (-1: no tour), its value, net: less the way's cost too, and the
+    value of the best tour that begins with the frontier held (-inf: none)."""
 
     first: int = -1
     value: float = -np.inf
+    net: float = -np.inf
     kept_value: float = -np.inf
 
 
@@ -170,55 +178,74 @@ def best_tour(gain: Floats, legs: Legs, first: int = -1) -> Tour:
 
     By local search (moves of single stops, turns of stretches) from the greedy order.
     """
-    cost, discount = legs
+    cost, discount, way = legs
     reached = np.isfinite(cost[-1])
     if not reached.any() or (first >= 0 and not reached[first]):
         return Tour(np.zeros(0, np.int64), -np.inf)
     order = _greedy(first, reached, gain, cost, discount)
     value = improve(order, 1 if first >= 0 else 0, gain, cost, discount)
-    return Tour(order, float(value))
+    return Tour(order, float(value), float(tour_value(order, gain, cost + way, discount)))
 
 
 def group_frontiers(
-    roads: RoadNet, frontiers: Slots, away: Floats, apart_m: float, most: int, keep: int
+    roads: RoadNet, frontiers: Slots, away: Floats, apart_m: float, most: int, keep: int, far: int = 0
 ) -> Groups:
-    """The groups of the nearest frontiers. away: (f,) cost of the way to each, inf without one. keep: a slot, or -1.
+    """The `most` nearest groups of frontiers, and of the others the `far` that promise most for the way there.
 
-    A frontier joins the group whose best frontier is within `apart_m` of it, straight; the frontier `keep` stands for
-    its group.
+    away: (f,) cost of the way to each, inf without one. keep: a slot, or -1. A frontier joins the group whose first
+    frontier is within `apart_m` of it, straight; the frontier `keep` stands for its group.
     """
     order = np.lexsort((roads.net.node_id[frontiers], away))
     order = order[np.isfinite(away[order])]
-    best: list[int] = [keep] if keep in frontiers[order] else []
-    members: list[list[int]] = [[] for _ in best]
-    of: dict[int, int] = {}
-    for slot in frontiers[order].tolist():
-        gap_m = [float(np.linalg.norm(roads.xyz_m[slot] - roads.xyz_m[b])) for b in best]
-        group = int(np.argmin(gap_m)) if gap_m and min(gap_m) <= apart_m else -1
+    slots, cost = frontiers[order].tolist(), away[order]
+    first: list[int] = [keep] if keep in slots else []
+    members: list[list[int]] = [[] for _ in first]
+    costs = [float(cost[slots.index(keep)])] if first else []
+    places = np.empty((len(slots) + 1, 3))
+    places[: len(first)] = roads.xyz_m[first]
+    for slot, to_it in zip(slots, cost.tolist(), strict=True):
+        gap_m = np.linalg.norm(places[: len(members)] - roads.xyz_m[slot], axis=1)
+        group = int(np.argmin(gap_m)) if gap_m.size and gap_m.min() <= apart_m else -1
         if group < 0:
-            if len(best) >= most:
+            if far == 0 and len(members) >= most:
                 continue
-            best.append(slot)
+            group = len(members)
+            places[group] = roads.xyz_m[slot]
             members.append([])
-            group = len(best) - 1
-        of[slot] = group
+            costs.append(to_it)
         members[group].append(slot)
     gain = roads.net.gain
-    for k, slots in enumerate(members):
-        if best[k] != keep:
-            best[k] = max(slots, key=lambda s: (gain[s], -roads.net.node_id[s]))
-    total = [
-        (1.0 - _NEXT_OF_GROUP) * max(gain[s] for s in slots) + _NEXT_OF_GROUP * sum(gain[s] for s in slots)
-        for slots in members
-    ]
-    return Groups(np.array(best, np.int32), np.array(total, np.float64), of)
+    total = np.array([_promise(gain[group]) for group in members])
+    chosen = _worth_going(total, np.array(costs), most, far)
+    best = [max(members[k], key=lambda s: (gain[s], -roads.net.node_id[s])) for k in chosen]
+    best[: len(first)] = first
+    of = {slot: k for k, group in enumerate(chosen) for slot in members[group]}
+    return Groups(np.array(best, np.int32), total[chosen], of)
+
+
+def _promise(gain: Floats) -> float:
+    """What a group of frontiers promises, from the gain of each."""
+    return float((1.0 - _NEXT_OF_GROUP) * gain.max() + _NEXT_OF_GROUP * gain.sum())
+
+
+def _worth_going(gain: Floats, cost: Floats, most: int, far: int) -> list[int]:
+    """The first `most` groups, and of the others the `far` with the most gain for their cost."""
+    others = np.arange(min(most, gain.size), gain.size)
+    rate = gain[others] / (cost[others] + _NEAR_COST)
+    chosen = others[np.argsort(-rate, kind="stable")[:far]]
+    return [*range(min(most, gain.size)), *sorted(chosen.tolist())]
 
 
 class Visits:
-    """The tour from the robot's node. gamma_per_m: of the reward."""
+    """The tour from the robot's node over the nearest groups, `most` of them; when that is worth less than `near_worth`
+    (nats), over as many far ones too. gamma_per_m: discount of gains and costs by the way driven before.
+    """
 
-    def __init__(self, roads: RoadNet, gamma_per_m: float, apart_m: float, most: int) -> None:
+    def __init__(
+        self, roads: RoadNet, gamma_per_m: float, apart_m: float, most: int, near_worth: float
+    ) -> None:
         self._roads, self._gamma, self._apart_m, self._most = roads, gamma_per_m, apart_m, most
+        self._near_worth = near_worth
 
     def first(self, start: int, held: int) -> Outlook:
         """Where to begin. start: the robot's slot. held: slot of the frontier that is the target, or -1."""
@@ -227,7 +254,14 @@ class Visits:
         if frontiers.size == 0:
             return Outlook()
         away, _ = self._ways(start, frontiers)
-        groups = group_frontiers(roads, frontiers, away, self._apart_m, self._most, held)
+        outlook = self._over(start, held, frontiers, away, 0)
+        if outlook.net < self._near_worth:
+            outlook = self._over(start, held, frontiers, away, self._most)
+        return outlook
+
+    def _over(self, start: int, held: int, frontiers: Slots, away: Floats, far: int) -> Outlook:
+        """The tour over the nearest groups and `far` of the others."""
+        groups = group_frontiers(self._roads, frontiers, away, self._apart_m, self._most, held, far)
         if groups.slot.size == 0:
             return Outlook()
         legs = self._legs(start, groups.slot)
@@ -241,7 +275,7 @@ class Visits:
         )
         if kept.value > tour.value:  # the search of the free tour ended in a worse place
             tour = kept
-        return Outlook(int(groups.slot[tour.order[0]]), tour.value, kept.value)
+        return Outlook(int(groups.slot[tour.order[0]]), tour.value, tour.net, kept.value)
 
     def _ways(self, source: int, targets: Slots) -> tuple[Floats, Floats]:
         net = self._roads.net
@@ -252,8 +286,12 @@ class Visits:
         return cost[targets], distance_m[targets]
 
     def _legs(self, start: int, stops: Slots) -> Legs:
-        cost, discount = np.full((stops.size + 1, stops.size), np.inf), np.zeros((stops.size + 1, stops.size))
+        shape, w = (stops.size + 1, stops.size), self._roads.weights
+        cost, discount, way = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
         for row, source in enumerate([*stops.tolist(), start]):
-            cost[row], distance_m = self._ways(source, stops)
-            discount[row] = self._gamma**distance_m
-        return Legs(cost, discount)
+            total, distance_m = self._ways(source, stops)
+            reached = np.isfinite(total)
+            way[row, reached] = w.k_cost * w.k_distance_per_m * distance_m[reached]
+            cost[row, reached] = np.maximum(total - way[row], 0.0)[reached]
+            discount[row, reached] = self._gamma ** distance_m[reached]
+        return Legs(cost, discount, way)

@@ -22,9 +22,12 @@ from services.irm.window import Window
 
 CUT_OFF = "cut off: no way for the robot was found"
 ISOLATED = "no way over the graph"
+BESIDE = "stood beside it and saw nothing new"
 _NO_WAY = (CUT_OFF, ISOLATED)
 _NEWS_M = 0.3
 """A place that a closure moves by more may have a way now."""
+_MANY_ROUNDS = 100
+"""What was a frontier before is no noise of one round."""
 
 
 @dataclass(slots=True)
@@ -57,7 +60,8 @@ class Frontier:
 class GivenUp:
     """A frontier that was given up, why, when it may come back, and whether it has come back before.
 
-    Place and keyframe as there.
+    One that does not come back then is still told, until it is found again or seen to be covered. Place and keyframe as
+    there.
     """
 
     x_m: float
@@ -69,6 +73,7 @@ class GivenUp:
     keyframe: int = NOBODY
     local_x_m: float = 0.0
     local_y_m: float = 0.0
+    opening: bool = False
 
 
 @dataclass(slots=True)
@@ -87,6 +92,7 @@ class FrontierManager:
     dropped_gain: float = 0.0
     _places: SpatialHash = field(default_factory=SpatialHash)
     _changed: set[int] = field(default_factory=set)
+    _back: list[int] = field(default_factory=list)
     _pursued: set[int] = field(default_factory=set)
     _least: float = 0.0
     _doubtful: frozenset[int] = frozenset()
@@ -109,10 +115,11 @@ class FrontierManager:
         in the window for certain, and is left as it is until the robot gets there.
         """
         self._doubtful = doubtful
-        next_id = self._second_chances(next_id)
-        self.given_up = [g for g in self.given_up if g.until_ns > now_ns]
         least = least_gain(self.config, ground_m2)
-        found = [f for f in find_frontiers(window, self.config, least) if not self._is_given_up(f[0], f[1])]
+        next_id = self._second_chances(next_id)
+        next_id = self._come_back(now_ns, least, next_id)
+        found = find_frontiers(window, self.config, least)
+        found = [f for f in found if not self._is_given_up(f.x_m, f.y_m, now_ns)]
         self._drop_small(window, least)
         inside = [self.frontiers[k] for k in sorted(self.near(window))]
         for frontier in inside:
@@ -127,9 +134,11 @@ class FrontierManager:
             if not frontier.seen:
                 self._miss(frontier, window, robot, now_ns)
         for index, (x, y, gain, opening) in enumerate(found):
+            again = self._drop_expired(x, y, now_ns)
             if index not in taken:
-                self._put(Frontier(next_id, x, y, gain, opening=opening), anchor)
+                self._put(Frontier(next_id, x, y, gain, opening=opening, again=again), anchor)
                 next_id += 1
+        self._drop_covered(window, now_ns)
         self._watch(window, robot, now_ns, elapsed_s)
         return next_id
 
@@ -172,7 +181,7 @@ class FrontierManager:
         robot = window.to_map(*s.centre_of(*window.robot_cell))
         return [k for k in inside if self._can_judge(self.frontiers[k], robot)]
 
-    def _can_judge(self, frontier: Frontier, robot: tuple[float, float]) -> bool:
+    def _can_judge(self, frontier: Frontier | GivenUp, robot: tuple[float, float]) -> bool:
         away_m = math.hypot(frontier.x_m - robot[0], frontier.y_m - robot[1])
         return frontier.keyframe not in self._doubtful or away_m <= self.config.opening_range_m
 
@@ -181,18 +190,20 @@ class FrontierManager:
         changed, self._changed = self._changed, set()
         return changed
 
+    def take_back(self) -> list[int]:
+        """Ids of the frontiers that came back since the last call: wherever they are, they have no edges yet."""
+        back, self._back = self._back, []
+        return back
+
     def follow(self, keyframes: dict[int, Planar]) -> list[int]:
         """Move what belongs to keyframes that SLAM has moved. Returns the ids of the frontiers that moved."""
-        kept = []
         for g in self.given_up:
             if g.keyframe in keyframes:
                 before = g.x_m, g.y_m
                 g.x_m, g.y_m = keyframes[g.keyframe].apply(g.local_x_m, g.local_y_m)
                 # A closure is news: what no way led to may have been a ghost of drift, or have a way now.
                 if g.reason in _NO_WAY and math.dist(before, (g.x_m, g.y_m)) > _NEWS_M:
-                    continue
-            kept.append(g)
-        self.given_up = kept
+                    g.until_ns = 0
         for g in self.aside:
             if g.keyframe in keyframes:
                 g.x_m, g.y_m = keyframes[g.keyframe].apply(g.local_x_m, g.local_y_m)
@@ -219,11 +230,42 @@ class FrontierManager:
         """With nothing else left, frontiers with much to gain that were given up come back, once."""
         if self.frontiers:
             return next_id
-        for g in [g for g in self.given_up if g.gain >= self.config.second_chance_gain and not g.again]:
+        return self._bring_back([g for g in self.given_up if self._is_much(g) and not g.again], next_id)
+
+    def _come_back(self, now_ns: int, least: float, next_id: int) -> int:
+        """What was given up comes back when its time is over, wherever the robot is, once: else the robot might go to
+        and fro for ever. Little that it saw nothing new of, right beside it, waits to be found again."""
+        expired = [g for g in self.given_up if g.until_ns <= now_ns and g.gain >= least and not g.again]
+        return self._bring_back([g for g in expired if g.reason != BESIDE or self._is_much(g)], next_id)
+
+    def _is_much(self, g: GivenUp) -> bool:
+        return g.gain >= self.config.second_chance_gain
+
+    def _bring_back(self, entries: list[GivenUp], next_id: int) -> int:
+        for node_id, g in enumerate(entries, next_id):
             self.given_up.remove(g)
-            self._keep(_frontier_again(next_id, g, True))
-            next_id += 1
-        return next_id
+            self._keep(_frontier_again(node_id, g, True))
+            self._back.append(node_id)
+        return next_id + len(entries)
+
+    def _drop_expired(self, x_m: float, y_m: float, now_ns: int) -> bool:
+        """A frontier was found here: what was given up here is that one. Returns whether there was any."""
+        expired, same_m = [g for g in self.given_up if g.until_ns <= now_ns], self.config.frontier_same_m
+        here = [g for g in expired if math.hypot(g.x_m - x_m, g.y_m - y_m) <= same_m]
+        self.given_up = [g for g in self.given_up if g not in here]
+        return bool(here)
+
+    def _drop_covered(self, window: Window, now_ns: int) -> None:
+        """What may come back and is seen to be covered is not left any more."""
+        robot = window.to_map(*window.spec.centre_of(*window.robot_cell))
+        for g in [g for g in self.given_up if g.until_ns <= now_ns]:
+            cell = window.cell(g.x_m, g.y_m)
+            if not window.spec.contains(*cell) or window.state[cell] == UNKNOWN:
+                continue
+            near = _around(window, cell)
+            left = self._open_near(window, near) or window.hopeful[near].any()
+            if not left and self._can_judge(g, robot):
+                self.given_up.remove(g)
 
     def _see_again(self, frontier: Frontier, found: Found, anchor: Anchor) -> None:
         if math.hypot(found.x_m - frontier.x_m, found.y_m - frontier.y_m) > 0.5:
@@ -255,11 +297,7 @@ class FrontierManager:
         row, column = window.cell(frontier.x_m, frontier.y_m)
         if window.state[row, column] == UNKNOWN:
             return
-        reach = round(1.0 / window.spec.resolution_m)
-        near = (
-            slice(max(0, row - reach), row + reach + 1),
-            slice(max(0, column - reach), column + reach + 1),
-        )
+        near = _around(window, (row, column))
         if frontier.opening and window.hopeful[near].any():
             away_m = math.hypot(frontier.x_m - robot[0], frontier.y_m - robot[1])
             if away_m > self.config.opening_range_m - 1.0:
@@ -267,11 +305,7 @@ class FrontierManager:
         if frontier.opening and frontier.rounds < self.config.opening_rounds:
             self._forget(frontier.node_id)
             return
-        looked = window.probability[near] >= self.config.covered_probability
-        open_ground = (
-            (window.state[near] != LETHAL) & ~looked & (window.ground[near] | (window.state[near] == FREE))
-        )
-        if not open_ground.any():
+        if not self._open_near(window, near):
             self._forget(frontier.node_id)
             return
         frontier.missed += 1
@@ -281,6 +315,12 @@ class FrontierManager:
             else:
                 self.give_up(frontier, CUT_OFF, now_ns)
 
+    def _open_near(self, window: Window, near: tuple[slice, slice]) -> bool:
+        """Whether something in this part of the window is left to be covered."""
+        looked = window.probability[near] >= self.config.covered_probability
+        ground = window.ground[near] | (window.state[near] == FREE)
+        return bool(((window.state[near] != LETHAL) & ~looked & ground).any())
+
     @staticmethod
     def _pairs(found: list[Found], old: list[Frontier]) -> list[tuple[float, int, int]]:
         pairs = [
@@ -288,9 +328,9 @@ class FrontierManager:
         ]
         return sorted(pairs)
 
-    def _is_given_up(self, x_m: float, y_m: float) -> bool:
-        near = 0.7 * self.config.give_up_radius_m
-        return any(math.hypot(g.x_m - x_m, g.y_m - y_m) < near for g in self.given_up)
+    def _is_given_up(self, x_m: float, y_m: float, now_ns: int) -> bool:
+        held, near = [g for g in self.given_up if g.until_ns > now_ns], 0.7 * self.config.give_up_radius_m
+        return any(math.hypot(g.x_m - x_m, g.y_m - y_m) < near for g in held)
 
     def _watch(self, window: Window, robot: tuple[float, float], now_ns: int, elapsed_s: float) -> None:
         """Give up frontiers beside which the robot has been for long and that yield nothing."""
@@ -301,7 +341,7 @@ class FrontierManager:
             if math.hypot(f.x_m - robot[0], f.y_m - robot[1]) <= self.config.give_up_radius_m:
                 f.beside_s += elapsed_s
             if f.beside_s > self.config.give_up_s:
-                self.give_up(f, "stood beside it and saw nothing new", now_ns)
+                self.give_up(f, BESIDE, now_ns)
 
     def progressed(self) -> None:
         """Ground was covered somewhere: the robot has better to do than to go to its target, which loses no time."""
@@ -352,7 +392,8 @@ class FrontierManager:
 
 
 def _given_up(f: Frontier, reason: str, until_ns: int) -> GivenUp:
-    return GivenUp(f.x_m, f.y_m, f.gain, reason, until_ns, f.again, f.keyframe, f.local_x_m, f.local_y_m)
+    local = f.local_x_m, f.local_y_m
+    return GivenUp(f.x_m, f.y_m, f.gain, reason, until_ns, f.again, f.keyframe, *local, f.opening)
 
 
 def _place_given_up(p: Place) -> GivenUp:
@@ -363,7 +404,15 @@ def _frontier_again(node_id: int, g: GivenUp, again: bool) -> Frontier:
     """What was given up as a frontier once more, under a new id."""
     back = Frontier(node_id, g.x_m, g.y_m, g.gain, again=again, keyframe=g.keyframe)
     back.local_x_m, back.local_y_m = g.local_x_m, g.local_y_m
+    back.opening, back.rounds = g.opening, _MANY_ROUNDS
     return back
+
+
+def _around(window: Window, cell: tuple[int, int]) -> tuple[slice, slice]:
+    """The part of the window within a metre of a cell in it."""
+    reach = round(1.0 / window.spec.resolution_m)
+    row, column = cell
+    return slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
 
 
 def _in_window(window: Window, frontier: Frontier) -> bool:

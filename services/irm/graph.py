@@ -43,6 +43,7 @@ class RoadGraph:
         self._changed: set[Key] = set()
         self._new_ways: set[tuple[int, int]] = set()
         self._published: dict[Any, tuple[Any, ...]] = {}
+        self._untold: set[tuple[int, int]] = set()
         self.shut: set[tuple[int, int]] = set()
         """Edges that lead through a fence: kept, but neither told nor gone along."""
 
@@ -113,9 +114,11 @@ class RoadGraph:
 
     def set_edge(self, a: int, b: int, distance: float, risk: float, driven: int) -> None:
         """Add an edge or replace what is known of it."""
-        is_new = not self.graph.has_edge(a, b)
+        is_new, key = not self.graph.has_edge(a, b), edge_key(a, b)
         self.graph.add_edge(a, b, distance=distance, risk=risk, driven=driven)
-        self._changed.add(edge_key(a, b))
+        self._changed.add(key)
+        if key in self.shut:
+            self._untold.add(key)
         if is_new and self._is_crumb(a) and self._is_crumb(b):
             self._components.join(a, b)
 
@@ -133,6 +136,8 @@ class RoadGraph:
         self.graph.remove_edge(a, b)
         self.shut.discard(key)
         self._changed.add(key)
+        if was_shut:
+            self._untold.add(key)
         if not was_shut and self._is_crumb(a) and self._is_crumb(b):
             self._components.part(a, b, self._crumbs_beside)
 
@@ -272,15 +277,19 @@ class RoadGraph:
 
     def difference(self, message: GlobalIrm) -> dict[str, Any]:
         """What a message that was just made tells, with all that the graph keeps of it: for the journal."""
+        whole = message.base_version == 0
         told = zip(message.edge_a.tolist(), message.edge_b.tolist(), strict=True)
-        ways = {edge for edge in self._new_ways if self.graph.has_edge(*edge)}  # which no message tells
-        edges, self._new_ways = sorted({*told, *ways}), set()
+        # No message tells of ways, nor of edges that are shut.
+        others = self._new_ways | self._untold | (self.shut if whole else set())
+        edges = sorted({*told, *(edge for edge in others if self.graph.has_edge(*edge))})
+        removed = {*map(tuple, message.removed_edge.tolist()), *self._untold}
+        self._new_ways, self._untold = set(), set()
         return {
-            "whole": message.base_version == 0,
+            "whole": whole,
             "nodes": [[n, dict(self.graph.nodes[n])] for n in message.node_id.tolist()],
             "edges": [[a, b, dict(self.graph.edges[a, b])] for a, b in edges],
             "removed_nodes": message.removed_node.tolist(),
-            "removed_edges": [e for e in message.removed_edge.tolist() if not self.graph.has_edge(*e)],
+            "removed_edges": [list(e) for e in sorted(removed) if not self.graph.has_edge(*e)],
         }
 
     def apply_difference(self, difference: dict[str, Any]) -> None:

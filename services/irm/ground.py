@@ -66,6 +66,8 @@ class GroundStore:
     def __init__(self, layer: TileLayer) -> None:
         self._layer = layer
         self._patches: dict[int, _Patch] = {}
+        self._tiles_of_patch: dict[int, set[tuple[int, int]]] = {}
+        self._patches_on: dict[tuple[int, int], set[int]] = {}
         self._current = NOBODY
         self._turn = 0
         self._changed: set[int] = set()
@@ -88,6 +90,7 @@ class GroundStore:
         if patch.placed != patch.pose:
             target, cells = moved(near, seen[ours], patch.motion.inverse().compose(frame))
         _grow(patch, target)
+        self._index(self._current)
         common = overlap(patch.spec, target)
         assert common is not None  # the patch has just grown over it
         known = cells != 0
@@ -112,6 +115,21 @@ class GroundStore:
         self._changed.add(self._current)
         return held
 
+    def _index(self, keyframe: int) -> set[tuple[int, int]]:
+        """Note which tiles a patch touches now. Returns them, and those that it touched before."""
+        patch, before = self._patches[keyframe], self._tiles_of_patch.get(keyframe, set())
+        now = self._tiles_of_patch[keyframe] = _tiles_of(bounds(patch.spec, patch.motion))
+        for tile in before - now:
+            self._patches_on[tile].discard(keyframe)
+        for tile in now - before:
+            self._patches_on.setdefault(tile, set()).add(keyframe)
+        return before | now
+
+    def _touching(self, tiles: set[tuple[int, int]]) -> list[tuple[int, _Patch]]:
+        """(keyframe, patch) of those that may touch these tiles, in the order in which they were seen."""
+        keyframes = {k for tile in tiles for k in self._patches_on.get(tile, ())}
+        return sorted(((k, self._patches[k]) for k in keyframes), key=lambda item: item[1].turn)
+
     def _paint(self, target: GridSpec, cells: NDArray[np.uint8]) -> None:
         layer = self._layer.read(target)
         self._layer.write(target, np.where(cells != 0, cells, layer))
@@ -122,8 +140,9 @@ class GroundStore:
         Before a loop is closed, the ground of long ago lies beside where it is: ghosts behind the walls.
         """
         out = np.zeros(spec.shape, np.uint8)
-        for keyframe, patch in sorted(self._patches.items(), key=lambda item: item[1].turn):
-            if keyframe in doubtful or overlap(bounds(patch.spec, patch.motion), bounds(spec, frame)) is None:
+        there = bounds(spec, frame)
+        for keyframe, patch in self._touching(_tiles_of(there)):
+            if keyframe in doubtful or overlap(bounds(patch.spec, patch.motion), there) is None:
                 continue
             to_odom = frame.inverse().compose(patch.motion)
             cells = resample(patch.unpacked(), patch.spec, spec, to_odom, 0)
@@ -138,18 +157,16 @@ class GroundStore:
         """Move the patches of keyframes that SLAM has moved. Returns how many tiles were put together anew."""
         tiles: set[tuple[int, int]] = set()
         for keyframe in sorted(keyframes.keys() & self._patches.keys()):
-            patch = self._patches[keyframe]
-            tiles |= _tiles_of(bounds(patch.spec, patch.motion))
-            patch.placed = keyframes[keyframe]
+            self._patches[keyframe].placed = keyframes[keyframe]
             self._changed.add(keyframe)
-            tiles |= _tiles_of(bounds(patch.spec, patch.motion))
+            tiles |= self._index(keyframe)
         if tiles:
             self._compose(tiles)
         return len(tiles)
 
     def _compose(self, tiles: set[tuple[int, int]]) -> None:
         self._layer.clear(tiles)
-        for patch in sorted(self._patches.values(), key=lambda p: p.turn):
+        for _, patch in self._touching(tiles):
             whole = bounds(patch.spec, patch.motion)
             touched = sorted(_tiles_of(whole) & tiles)
             if not touched:
@@ -173,6 +190,9 @@ class GroundStore:
     def set_state(self, state: dict[str, Any]) -> None:
         """From a snapshot, with the layer as it was then."""
         self._patches = {int(k): _unpack(*packed) for k, *packed in state["patches"]}
+        self._tiles_of_patch, self._patches_on = {}, {}
+        for keyframe in self._patches:
+            self._index(keyframe)
         self._go_on(state)
 
     def _go_on(self, state: dict[str, Any]) -> None:
@@ -200,9 +220,10 @@ class GroundStore:
         tiles: set[tuple[int, int]] = set()
         for k, *packed in changes["patches"]:
             old, new = self._patches.get(int(k)), _unpack(*packed)
-            if old is not None and old.placed != new.placed:
-                tiles |= _tiles_of(bounds(old.spec, old.motion)) | _tiles_of(bounds(new.spec, new.motion))
             self._patches[int(k)] = new
+            touched = self._index(int(k))
+            if old is not None and old.placed != new.placed:
+                tiles |= touched
         self._go_on(changes)
         if tiles:
             self._compose(tiles)

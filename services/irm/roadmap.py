@@ -92,6 +92,7 @@ class Roadmap:
         self.next_id = self.manager.update(
             window, (x_m, y_m), now_ns, elapsed_s, self.next_id, ground_m2, anchor, doubtful
         )
+        self._back += self.manager.take_back()
         self._doubtful = doubtful
         search = Search(window)
         search.run(window.robot_cell, 3.0 * self.config.max_edge_m)
@@ -144,7 +145,10 @@ class Roadmap:
         for node in [n for n in self._back if n in self.graph]:
             x, y = self.road.place(node)
             z = self.graph.nodes[node]["z"]
-            for _, other in self._near(x, y, z, 3.0 * self.config.max_edge_m, BREADCRUMB)[:3]:
+            # Of a place in doubt: to what is in doubt as well, which was seen on the same way.
+            certain, reach_m = self._is_certain(node), 3.0 * self.config.max_edge_m
+            around = self.road.near(x, y, z, reach_m, BREADCRUMB)
+            for other in [n for _, n in around if self._is_certain(n) == certain][:3]:
                 straight = max(self.road.straight_m(node, other), 1e-3)
                 if not self._is_fenced(node, other):
                     self.road.set_edge(node, other, _GUESSED_TIMES * straight, _GUESSED_RISK, 0)
@@ -252,11 +256,17 @@ class Roadmap:
             # Riskier than thought, perhaps, but it leads there: the robot must not be cut off from where it came from.
             self.road.set_edge(a, b, self._climbed_m(a, b, d), min(rho, _MOST_RISK), 1)
             return True
+        if d >= self.config.max_edge_m and not held["driven"] and self._may_lead(place, target, search):
+            return False
         # No way within the window is no evidence against a way that the robot has driven: it may lead around outside.
         misplaced = search.is_lethal(*place) or search.is_lethal(*target)
         if not held["driven"] or (not misplaced and self._is_refuted(a, b, search)):
             self.road.drop_edge(a, b)
         return False
+
+    def _may_lead(self, start: tuple[float, float], end: tuple[float, float], search: Search) -> bool:
+        """Whether a way may lead over what the risk map has forgotten, at the start or between: no evidence."""
+        return not search.knows(*start) or search.remembered_m(*end) < self.config.max_edge_m
 
     def _is_refuted(self, a: int, b: int, search: Search) -> bool:
         """Whether something stands, time after time, where the robot went from a to b."""

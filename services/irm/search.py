@@ -24,19 +24,33 @@ class Search:
         self._window = window
         self._cost = np.full(window.spec.shape, np.inf)
         self._parent = np.full(window.spec.shape, -1, np.int32)
+        self._start, self._reach_m = (-1, -1), 0.0
+        self._remembered: Search | None = None
 
     def run(self, start: tuple[int, int], reach_m: float) -> None:
         """Search from a cell, up to `reach_m` away (straight)."""
-        w = self._window
-        row, column = start
+        self._start, self._reach_m, self._remembered = start, reach_m, None
+        self._run(self._window.free_space)
+
+    def _run(self, passable: NDArray[np.bool_]) -> None:
+        w, reach_m = self._window, self._reach_m
+        row, column = self._start
         if not w.spec.contains(row, column):
             return
         cells = math.ceil(reach_m / w.spec.resolution_m)
         box = (row - cells, row + cells + 1, column - cells, column + cells + 1)
         dijkstra_box(
-            w.step_cost, w.free_space, w.spec.resolution_m, row, column, box, _NO_TARGETS, 4.0 * reach_m,
+            w.step_cost, passable, w.spec.resolution_m, row, column, box, _NO_TARGETS, 4.0 * reach_m,
             self._cost, self._parent,
         )  # fmt: skip
+
+    def remembered_m(self, x_m: float, y_m: float) -> float:
+        """Distance to a point over ground that the risk map may have forgotten; inf when no way leads there."""
+        if self._remembered is None:
+            self._remembered = Search(self._window)
+            self._remembered._start, self._remembered._reach_m = self._start, self._reach_m
+            self._remembered._run(self._window.reachable)
+        return self._remembered.to(x_m, y_m)[0]
 
     def to(self, x_m: float, y_m: float) -> tuple[float, float]:
         """(distance, rho) of the best path to a point; (inf, 1) when there is none."""

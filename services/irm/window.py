@@ -225,7 +225,8 @@ def connected_free_space(passable: NDArray[np.bool_], robot: tuple[int, int]) ->
     row, column = robot
     for reach in range(7):
         r0, c0 = max(0, row - reach), max(0, column - reach)
-        piece = passable[r0 : min(height, row + reach + 1), c0 : min(width, column + reach + 1)]
+        r1, c1 = max(0, min(height, row + reach + 1)), max(0, min(width, column + reach + 1))
+        piece = passable[r0:r1, c0:c1]
         found = np.argwhere(piece)
         if len(found):
             offsets = found + np.array([r0 - row, c0 - column])

@@ -30,4 +30,6 @@ CEILING: Final = 10
 """Lowest point above the robot, z in odom, m; without meaning while CEILING_SEEN is 0."""
 CEILING_SEEN: Final = 11
 """Points of the ceiling."""
-CHANNELS: Final = 12
+HIT_AT: Final = 12
+"""Distance that the robot had driven when an obstacle was last hit here, m; without meaning while there is none."""
+CHANNELS: Final = 13

@@ -29,7 +29,10 @@ class RiskLayers(NamedTuple):
 
 @cache
 def cvar_factor(alpha: float) -> float:
-    """CVaR_alpha of a normal variable is mean + factor * deviation: pdf(quantile(alpha)) / (1 - alpha)."""
+    """CVaR_alpha of a normal variable is mean + factor * deviation: pdf(quantile(alpha)) / (1 - alpha), at alpha 0 no
+    deviation."""
+    if alpha <= 0.0:
+        return 0.0
     return float(norm.pdf(norm.ppf(alpha)) / (1.0 - alpha))
 
 

@@ -139,11 +139,14 @@ class Config(BaseModel):
     limit_hazard_per_m: float = Field(
         0.2, gt=0, le=100, description="Hazard rate of terrain at a limit, 1/m."
     )
-    cvar_alpha: float = Field(0.9, gt=0, lt=1, description="CVaR level: more is more careful.")
+    cvar_alpha: float = Field(
+        0.9, ge=0, lt=1, description="CVaR level: more is more careful; 0: the mean hazard, no CVaR."
+    )
     max_clearance_m: float = Field(1.5, gt=0.3, le=5, description="Clearance is measured up to this, m.")
     risk_blind: bool = Field(
         False,
-        description="Experiments only: no terrain hazard, only what is above the knee is an obstacle, no CVaR.",
+        description="Experiments only: terrain is neither hazard nor lethal, only what is above the knee an obstacle; "
+        "no CVaR.",
     )
     knee_height_m: float = Field(
         0.4, gt=0, le=2, description="What a risk-blind robot takes for an obstacle, m."

@@ -36,6 +36,10 @@ class Drift:
             self._at = (x_m, y_m)
         return self._driven_m
 
+    def count(self, driven_m: float) -> None:
+        """The robot has driven so far by somebody else's count, m: instead of `drive`."""
+        self._driven_m = driven_m
+
     def close(self, map_to_odom: Pose, robot: Pose) -> None:
         """Where `odom` lies in `map`: when that jumps, a loop was closed. robot: in `odom`."""
         frame = planar(map_to_odom)

@@ -93,7 +93,7 @@ class RiskMapStage:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._model: Model = TerrainModel(config) if config.model == "terrain" else FlatModel(config)
-        self._stamp_ns = -1
+        self._cloud_ns = self._grid_ns = -1
         self._published_ns = -(10**18)
         self._news = False
         self._pose = Pose()
@@ -124,7 +124,7 @@ class RiskMapStage:
                 self._news |= taken
                 if taken:
                     found.append(
-                        Output(MOVING, MovingPoints(stamp_ns=self._stamp_ns, points_m=self._moving_m()))
+                        Output(MOVING, MovingPoints(stamp_ns=self._cloud_ns, points_m=self._moving_m()))
                     )
         for grid in inputs.new(READY_GRID):
             if self._timely(now, grid.message):
@@ -133,7 +133,7 @@ class RiskMapStage:
         due = now - self._published_ns >= self._config.publish_period_s * SECOND_NS - SECOND_NS // 100
         if not due or not (self._news or standing):
             return found
-        stamp_ns = max(self._stamp_ns, 0)
+        stamp_ns = max(self._cloud_ns, self._grid_ns, 0)
         if standing:
             self._roll_to(self._pose)
             stamp_ns = max(stamp_ns, _stamp(odometry.message if odometry is not None else None, now))
@@ -156,7 +156,7 @@ class RiskMapStage:
         self._roll_to(self._pose)
         self._grid = grid
         self._model.apply_grid(grid, self._pose, only_new=False)
-        self._stamp_ns = max(self._stamp_ns, grid.stamp_ns)
+        self._grid_ns = max(self._grid_ns, grid.stamp_ns)
         self._news = True
 
     def _roll_to(self, pose: Pose) -> None:
@@ -165,11 +165,11 @@ class RiskMapStage:
             self._model.apply_grid(self._grid, self._pose, only_new=True)
 
     def _integrate(self, cloud: PointCloud) -> bool:
-        if cloud.points_m.shape[0] == 0 or cloud.stamp_ns <= self._stamp_ns:
+        if cloud.points_m.shape[0] == 0 or cloud.stamp_ns <= self._cloud_ns:
             return False
         self._roll_to(cloud.sensor_in_odom)
         self.bad_points += self._model.integrate(cloud)
-        self._stamp_ns = cloud.stamp_ns
+        self._cloud_ns = cloud.stamp_ns
         return True
 
     def _moving_m(self) -> NDArray[np.float32]:
@@ -199,7 +199,7 @@ class RiskMapStage:
         return pack_snapshot(
             {
                 "model": self._model.state(),
-                "stamps": [self._stamp_ns, self._published_ns],
+                "stamps": [self._cloud_ns, self._grid_ns, self._published_ns],
                 "news": self._news,
                 "pose": self._pose.model_dump(),
                 "grid": None if self._grid is None else self._grid.model_dump(),
@@ -211,7 +211,7 @@ class RiskMapStage:
         """Go on from a snapshot."""
         state = unpack_snapshot(snapshot)
         self._model.load(state["model"])
-        self._stamp_ns, self._published_ns = state["stamps"]
+        self._cloud_ns, self._grid_ns, self._published_ns = state["stamps"]
         self._news = bool(state["news"])
         self._pose = Pose(**state["pose"])
         self._grid = None if state["grid"] is None else ReadyGrid(**state["grid"])

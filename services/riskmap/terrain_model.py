@@ -13,6 +13,7 @@ from schemas.base import Pose
 from schemas.sensing import PointCloud, ReadyGrid
 from services.riskmap.cells import (
     CHANNELS,
+    HIT_AT,
     HIT_WEIGHT,
     HIT_X,
     HIT_Y,
@@ -23,6 +24,7 @@ from services.riskmap.cells import (
 )
 from services.riskmap.collision import RiskLayers
 from services.riskmap.config import Config
+from services.riskmap.drift import Drift
 from services.riskmap.extrinsics import base_in_odom, body_box, transform, without_body
 from services.riskmap.gaps import join_rings
 from services.riskmap.grid_layers import grid_layers
@@ -44,6 +46,7 @@ class TerrainModel:
         self._config = config
         self._window = RingWindow(config.window_m, config.resolution_m, CHANNELS)
         self._travelled_m = 0.0
+        self._drift = Drift(0.0)
         self._last_xyz: list[float] = []
         self._feet_m = 0.0
         self._box = body_box(config)
@@ -59,7 +62,8 @@ class TerrainModel:
         return np.zeros((0, 2), dtype=np.float32)
 
     def located(self, map_to_odom: Pose, robot: Pose) -> None:
-        """Where SLAM says that `odom` lies in `map`: of no concern, what is old grows uncertain here."""
+        """Where SLAM says that `odom` lies in `map`; robot: its pose in `odom`. Only closures count: see `_forget`."""
+        self._drift.close(map_to_odom, robot)
 
     def roll_to(self, x_m: float, y_m: float) -> bool:
         """Centre the window on a point. Returns whether it moved."""
@@ -71,6 +75,7 @@ class TerrainModel:
         base = base_in_odom(cloud.sensor_in_odom, cloud.sensor_in_base)
         first = not self._last_xyz
         self._move_to(base)
+        self._forget()
         points_m = without_body(cloud.points_m, transform(cloud.sensor_in_base), self._box)
         reach_m = min(cloud.range_m, c.window_m * math.sqrt(0.5)) + c.resolution_m
         sweep, bad = read_sweep(points_m, transform(cloud.sensor_in_odom), c.resolution_m, reach_m)
@@ -79,6 +84,7 @@ class TerrainModel:
         fuse_ground(sweep, kind, ground, cells, rules)
         lowest_m = max(c.knee_height_m, c.max_step_m) if c.risk_blind else c.max_step_m
         hit_now = add_hits(sweep, ground, lowest_m, c.clamp_log_odds, cells, rules)
+        cells[hit_now, HIT_AT] = self._travelled_m
         clear_pierced(sweep, hit_now, cells, rules)
         join_rings(sweep, kind, ground, cells, rules)
         x, y = self._last_xyz[:2]
@@ -95,6 +101,29 @@ class TerrainModel:
             self._travelled_m += math.dist(xyz, self._last_xyz)
         self._last_xyz = xyz
         self._feet_m = xyz[2] - self._config.base_height_m
+        self._drift.count(self._travelled_m)
+
+    def _forget(self) -> None:
+        """What was last seen too long before a closure does not lie where it seems to: it becomes unknown.
+
+        Not the ground around the robot, up to where rays reach it: nothing would make it known again.
+        """
+        before_m = self._drift.keeps_from_m()
+        if before_m == -math.inf:
+            return
+        cells = self._window.cells
+        stands, old_hit = cells[..., LOG_ODDS] > 0.0, cells[..., HIT_AT] < before_m
+        old_ground = (cells[..., VARIANCE] > 0.0) & (cells[..., TRAVELLED] < before_m)
+        cells[np.where(stands, old_hit, old_ground & ~self._around_robot())] = 0.0
+
+    def _around_robot(self) -> NDArray[np.bool_]:
+        """(h, w) in memory's order: what is so near to the robot that the lowest ring passes over it."""
+        s, (row0, column0) = self._window.spec, self._window.origin
+        x_m, y_m = self._last_xyz[:2]
+        dx = np.roll(s.centres_x(), column0) - x_m
+        dy = np.roll(s.centres_y(), row0) - y_m
+        near: NDArray[np.bool_] = dy[:, None] ** 2 + dx[None, :] ** 2 <= self._config.start_radius_m**2
+        return near
 
     def _rules(self, base: NDArray[np.float64], sensor: NDArray[np.float64]) -> GroundRules:
         c, s = self._config, self._window.spec
@@ -124,6 +153,7 @@ class TerrainModel:
         cells[take, LOG_ODDS] = evidence[take]
         for hits in (HIT_WEIGHT, HIT_X, HIT_Y):
             cells[take, hits] = 0.0
+        cells[take, HIT_AT] = self._travelled_m
         bare = take & (evidence < 0.0) & (cells[:, VARIANCE] == 0.0)
         cells[bare, MEAN] = robot.z_m - self._config.base_height_m
         cells[bare, VARIANCE] = self._config.start_sigma_m**2
@@ -173,6 +203,7 @@ class TerrainModel:
             "travelled_m": self._travelled_m,
             "last_xyz": self._last_xyz,
             "feet_m": self._feet_m,
+            "drift": self._drift.state(),
         }
 
     def load(self, state: dict[str, Any]) -> None:
@@ -181,6 +212,7 @@ class TerrainModel:
         self._travelled_m = float(state["travelled_m"])
         self._last_xyz = list(state["last_xyz"])
         self._feet_m = float(state["feet_m"])
+        self._drift.load(state["drift"])
 
 
 def _body_slope(base: NDArray[np.float64]) -> tuple[float, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -73,12 +74,15 @@ def test_the_worlds_of_a_campaign_win_over_file_and_variant(tmp_path: Path) -> N
 def test_built_in_variants_are_valid_and_blind() -> None:
     variants = [Variant.parse(name) for name in BUILT_IN_VARIANTS]
     runs = {run.variant: run for run in Campaign([World.built_in("cave")], variants, [1]).runs()}
-    blind = runs["risk_blind"].config
-    assert check_service(blind, "riskmap").risk_blind is True  # type: ignore[union-attr]
-    assert check_service(blind, "gcp").reward.k_risk == 0.0  # type: ignore[union-attr]
-    assert check_service(blind, "lcp").weights.k_risk == 0.0  # type: ignore[union-attr]
-    assert check_service(blind, "reconciler").weights.k_risk == 0.0  # type: ignore[union-attr]
-    assert runs["default"].fingerprint != runs["risk_blind"].fingerprint
+    for name in ("risk_neutral", "risk_blind"):
+        blind = runs[name].config
+        riskmap: Any = check_service(blind, "riskmap")
+        assert riskmap.alpha == 0.0, "no CVaR"
+        assert riskmap.risk_blind is (name == "risk_blind"), "terrain hazard goes with one of them only"
+        assert check_service(blind, "gcp").reward.k_risk == 0.0  # type: ignore[union-attr]
+        assert check_service(blind, "lcp").weights.k_risk == 0.0  # type: ignore[union-attr]
+        assert check_service(blind, "reconciler").weights.k_risk == 0.0  # type: ignore[union-attr]
+    assert len({runs[name].fingerprint for name in ("default", "risk_neutral", "risk_blind")}) == 3
 
 
 def test_variants_are_read_from_files(tmp_path: Path) -> None:

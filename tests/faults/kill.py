@@ -76,18 +76,12 @@ class Mission:
             for kill in self.kills
             if kill.back_s is None or kill.back_s > within_s
         ]
-        # A record that was written but not published before the kill may have changed what was acknowledged.
-        found += [f"acknowledged and lost: {h}" for h in self.handovers if h.version_step == 1 and _lost(h)]
-        found += [f"the first graph of a new life is not whole: {h}" for h in self.handovers if not h.whole]
+        found += [fault for handover in self.handovers for fault in handover.faults()]
         found += [f"the judge took back {back:.4f}" for back in self.setbacks["judge"] if back > 1e-9]
         found += [f"the robot jumped {jump:.2f} m" for jump in self.setbacks["jump_m"] if jump > 1.0]
         if self.finish != "covered" or self.lost:
             found.append(f"the mission ended {self.finish or 'unfinished'}, lost: {self.lost}")
         return found
-
-
-def _lost(handover: Handover) -> bool:
-    return handover.lost_nodes + handover.lost_edges > 0 or not handover.whole
 
 
 class Killer:

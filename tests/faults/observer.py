@@ -47,7 +47,8 @@ class Handover:
     """What a restarted irm said first, against what it had acknowledged.
 
     nodes, edges: acknowledged before. lost_nodes, lost_edges: of these, missing or changed in the first message.
-    version_step: versions from the last message heard to the first of the new life; 1 when none was journaled in vain.
+    version_step: versions from the last message heard to the first of the new life; 1 when none was journaled in vain,
+    less when a version was given twice: the journal has lost records that were acknowledged.
     """
 
     nodes: int
@@ -56,6 +57,18 @@ class Handover:
     lost_edges: int
     version_step: int
     whole: bool
+
+    def faults(self) -> list[str]:
+        """In plain words, what is not as it must be."""
+        found = []
+        # Beyond one step, a record that was written but not published may have changed what was acknowledged.
+        if self.version_step <= 1 and self.lost_nodes + self.lost_edges > 0:
+            found.append(f"acknowledged and lost: {self}")
+        if self.version_step < 1:
+            found.append(f"the journal lost its last records, a version was given twice: {self}")
+        if not self.whole:
+            found.append(f"the first graph of a new life is not whole: {self}")
+        return found
 
 
 @dataclass(slots=True)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from planning.fences import Placed, place, polygon
 from planning.frames import Planar
 from planning.grid import FREE
+from schemas.base import Pose
 from services.irm.config import Config
 from services.irm.frontiers import FrontierManager
 from services.irm.keyframes import Anchor
@@ -87,8 +89,6 @@ def corridor() -> Roadmap:
 
 def told(roadmap: Roadmap, whole: bool = False) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """(edges told, edges taken away) by the next message."""
-    from schemas.base import Pose
-
     message = roadmap.message(Pose(), Pose(), 0, whole)
     edges = list(zip(message.edge_a.tolist(), message.edge_b.tolist(), strict=True))
     return edges, [(a, b) for a, b in message.removed_edge.tolist()]
@@ -113,14 +113,29 @@ def test_edges_through_a_fence_are_kept_and_not_told() -> None:
 def test_a_journal_keeps_edges_that_are_shut() -> None:
     roadmap, twin = corridor(), corridor()
     across = [(2.5, -1.0), (3.5, -1.0), (3.5, 1.0), (2.5, 1.0), (2.5, -1.0)]
-    from schemas.base import Pose
-
     roadmap.fence(fences(across), True, [])
     record = roadmap.difference(roadmap.message(Pose(), Pose(), 0, False))
     twin.apply_difference(record)
     assert twin.graph.has_edge(2, 3)
     assert twin.road.shut == {(2, 3)}
     assert (2, 3) not in told(twin, True)[0]
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_journal_tells_of_shut_edges_that_change_or_go(whole: bool) -> None:
+    """No message tells of them, as they have been taken away from the readers before."""
+    roadmap, twin = corridor(), corridor()
+    across = [(2.5, -1.0), (5.5, -1.0), (5.5, 1.0), (2.5, 1.0), (2.5, -1.0)]
+    roadmap.fence(fences(across), True, [])
+    twin.apply_difference(roadmap.difference(roadmap.message(Pose(), Pose(), 0, whole)))
+    roadmap.road.drop_edge(2, 3)  # as a closure does that tears it
+    roadmap.road.set_edge(3, 4, 2.5, 0.1, 0)
+    twin.apply_difference(roadmap.difference(roadmap.message(Pose(), Pose(), 0, False)))
+    assert not twin.graph.has_edge(2, 3)
+    assert twin.graph.edges[3, 4] == roadmap.graph.edges[3, 4]
+    assert twin.road.shut == roadmap.road.shut == {(3, 4)}
+    twin.fence(Placed(), True, [])
+    assert (3, 4) in told(twin, True)[0]
 
 
 def test_a_priority_counts_more() -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from planning.frames import Planar
 from planning.graph_mirror import GraphMirror
-from planning.grid import FREE, LETHAL, GridSpec
+from planning.grid import FREE, LETHAL, UNKNOWN, GridSpec
 from planning.search import dijkstra_grid, trace_path
 from schemas.base import Pose
 from schemas.codec import Envelope, decode, encode
@@ -324,6 +324,27 @@ def test_edges_go_when_a_wall_is_seen_between_their_ends_and_come_back_with_the_
     drive.stay(6.0, 0.1)
     after = drive.between(7.5, 10.0)
     assert after is not None and after["distance"] == pytest.approx(before["distance"], abs=0.5)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "what", "kept"),
+    [(3.0, 4.5, UNKNOWN, True), (-1.0, 3.0, UNKNOWN, True), (3.0, 4.5, LETHAL, False)],
+)
+def test_an_edge_that_nobody_drove_goes_for_a_wall_and_not_for_forgotten_ground(
+    low: float, high: float, what: int, kept: bool
+) -> None:
+    """Forgotten between its ends, or at one of them."""
+    flat = room(0.0, 0.0, 12.0, 3.0, 0.5, 0.5)
+    belief, roadmap = Belief.new(CONFIG, 0.5), Roadmap(CONFIG, next_id=9, last_breadcrumb=3)
+    for k, x in ((1, 1.75), (2, 5.75), (3, 9.75)):
+        roadmap.road.set_node(k, x, 1.75, 0.0, BREADCRUMB, 0.0, 1.0)
+    roadmap.road.set_edge(1, 2, 4.0, 0.0, 0)
+    belief.window(flat.risk_map(9.75, 1.75), 9.75, 1.75)
+    flat.fill(low, -1.0, high, 4.0, what)
+    for k in range(4):
+        roadmap.update(belief.window(flat.risk_map(9.75, 1.75), 9.75, 1.75), 9.75, 1.75, k * SECOND, 1.0)
+        roadmap.message(Pose(), Pose(), k, False)
+    assert roadmap.graph.has_edge(1, 2) is kept
 
 
 def test_a_path_of_a_search_has_its_own_length_and_hazard() -> None:

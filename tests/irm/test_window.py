@@ -13,7 +13,7 @@ from scipy import ndimage
 from planning.coverage import LOG_2, entropy
 from planning.grid import FREE, LETHAL, UNKNOWN
 from services.irm.config import Config
-from services.irm.window import dilate_disc, window_picture, without_slivers
+from services.irm.window import connected_free_space, dilate_disc, window_picture, without_slivers
 from tests.irm.worlds import RADIUS_M, Belief, cluttered, room, two_rooms
 
 RES = 0.1
@@ -203,3 +203,10 @@ def test_the_picture_shows_each_kind_of_cell() -> None:
     shown = [int(cell[rc]) if flat.spec.contains(*rc) else 0 for rc in at]
     assert shown == [0, 1, 2, 3, 4]
     assert cell[0, 0] == 0
+
+
+@given(row=st.integers(-60, 100), column=st.integers(-60, 100))
+def test_a_robot_out_of_the_window_reaches_only_what_lies_beside_it(row: int, column: int) -> None:
+    reached = connected_free_space(np.ones((40, 50), np.bool_), (row, column))
+    away = max(-row, row - 39, -column, column - 49, 0)
+    assert reached.all() if away <= 6 else not reached.any()

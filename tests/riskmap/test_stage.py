@@ -11,7 +11,7 @@ from schemas.base import Pose
 from schemas.codec import Envelope, decode, encode
 from schemas.contract import SECOND_NS, Outputs, StageSetup
 from schemas.sensing import PointCloud, ReadyGrid
-from schemas.topics import CLOUD, ODOMETRY, READY_GRID, RISK_MAP
+from schemas.topics import CLOUD, MOVING, ODOMETRY, READY_GRID, RISK_MAP
 from schemas.world import RiskMap
 from services.riskmap.stage import Config, RiskMapStage, create, spec, warm_up
 from tests.riskmap.helpers import cloud, inputs, merged, odometry, rectangle
@@ -192,14 +192,20 @@ def test_a_ready_grid_alone_makes_a_risk_map(model: str) -> None:
     wire(message)
 
 
-def test_a_cloud_older_than_a_ready_grid_is_ignored() -> None:
-    room = stage()
-    room.step(5 * TENTH, inputs((READY_GRID, grid_of(np.zeros((16, 16), np.int8), 5 * TENTH))))
-    before = room._model.state()["layers"][0].copy()
-    step(room, 6 * TENTH, stamp_ns=4 * TENTH)
-    assert np.array_equal(room._model.state()["layers"][0], before)
-    step(room, 7 * TENTH, stamp_ns=6 * TENTH)
-    assert not np.array_equal(room._model.state()["layers"][0], before)
+@both
+def test_ready_grids_do_not_silence_the_clouds(model: str) -> None:
+    """A cloud takes longer to come than a grid: its stamp is older than that of the grid which was there before it."""
+    room = stage(model)
+    taken = 0
+    for k in range(5, 15):
+        free = grid_of(np.zeros((16, 16), np.int8), k * TENTH)
+        room.step(k * TENTH, inputs((READY_GRID, free)))
+        late = room.step(k * TENTH + 1, inputs((CLOUD, cloud(ROOM, 0, 0, k * TENTH - TENTH // 2))))
+        taken += sum(output.topic is MOVING for output in late)
+    assert taken == 10
+    message = risk_map(room.step(20 * TENTH, inputs()))
+    assert message.stamp_ns >= 14 * TENTH, "of the newer of both"
+    assert state_at(message, 4.01, 0.01) == LETHAL, "seen by the clouds alone"
 
 
 def large_grid(stamp_ns: int) -> ReadyGrid:
@@ -264,7 +270,7 @@ def test_the_profile_sets_the_defaults_and_fields_override_it() -> None:
     husky = Config.model_validate({"profile": "husky", "max_step_m": 0.07})
     assert (husky.footprint_radius_m, husky.max_slope_rad, husky.max_step_m) == (0.335, 0.42, 0.07)
     assert Config() == Config(profile="spot")
-    assert (Config(risk_blind=True).alpha, Config().alpha) == (0.0, 0.9)
+    assert (Config(risk_blind=True).alpha, Config(cvar_alpha=0.0).alpha, Config().alpha) == (0.0, 0.0, 0.9)
     with pytest.raises(ValueError, match="profile"):
         Config.model_validate({"profile": "tank"})
 

@@ -445,6 +445,18 @@ def test_risk_blind_sees_walls_and_no_terrain() -> None:
         assert np.array_equal(layers.hazard_cvar, layers.hazard_mean) == blind
 
 
+def test_without_cvar_the_mean_counts_and_what_is_lethal_stays_so() -> None:
+    world: Heights = lambda x, y: np.where((x > 3.6) & (np.abs(y) < 1.0), -0.6, 0.0)  # noqa: E731
+    found = []
+    for alpha in (0.9, 0.0):
+        model, base = drive(world, np.arange(0.0, 1.0, 0.1), cvar_alpha=alpha)
+        layers = layers_of(model, base)
+        assert np.array_equal(layers.hazard_cvar, layers.hazard_mean) == (alpha == 0.0)
+        found.append(layers)
+    assert (found[0].state == LETHAL).any(), "the rim of the pit"
+    assert np.array_equal(found[0].state, found[1].state)
+
+
 def test_elevation_is_finite_everywhere_and_right_where_seen() -> None:
     heights = plane(0.1)
     model, base = drive(heights, np.arange(0.0, 1.0, 0.1))

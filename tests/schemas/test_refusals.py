@@ -28,10 +28,10 @@ from schemas.errors import (
     ValueRangeError,
 )
 from schemas.operation import MissionCommand
-from schemas.sensing import Odometry, PointCloud
+from schemas.sensing import Odometry, PointCloud, PoseGraph
 from schemas.topics import CLOUD, COMMAND, MISSION, ODOMETRY
 from schemas.world import GlobalIrm, RiskMap
-from tests.schemas.examples import MESSAGES, body_of, encoded, example, sign
+from tests.schemas.examples import ENVELOPE, MESSAGES, body_of, encoded, example, sign
 
 LIMIT = 1 << 20
 
@@ -327,3 +327,28 @@ def test_sequences_count_by_topic() -> None:
         assert envelope == Envelope("husky1", "sim", 4, sequence, 9, {"reconciler/plan": (1, 2)})
     _, envelope = decode(outbox.pack(Output(CLOUD, example(PointCloud)), 9, {}), PointCloud, LIMIT)
     assert envelope.sequence == 1
+
+
+@pytest.mark.parametrize("ids", [[5, 1, 3], [1, 1, 3], [1, 3, 3]])
+def test_keyframes_whose_ids_do_not_increase_are_refused_by_name(ids: list[int]) -> None:
+    """irm bisects them: an order of its own would silently hang what was seen on other keyframes."""
+
+    def change(body: Any) -> None:
+        body["columns"]["keyframe_id"][2] = raw(ids, "<i8")
+
+    with pytest.raises(ValueRangeError, match=r"pose_graph\.keyframe_id: entry \d is \d after \d"):
+        decode(tampered(PoseGraph, change), PoseGraph, LIMIT)
+
+
+def test_no_keyframes_and_gaps_between_their_ids_are_fine() -> None:
+    none = PoseGraph(
+        stamp_ns=1, revision=0, keyframe_id=np.zeros(0, np.int64), pose_in_map=np.zeros((0, 4)),
+        covariance=np.zeros((0, 3)),
+    )  # fmt: skip
+    assert decode(encode(none, ENVELOPE), PoseGraph, LIMIT)[0].keyframe_id.size == 0
+
+    def change(body: Any) -> None:
+        body["columns"]["keyframe_id"][2] = raw([3, 40, 41], "<i8")
+
+    decoded, _ = decode(tampered(PoseGraph, change), PoseGraph, LIMIT)
+    assert decoded.keyframe_id.tolist() == [3, 40, 41]

@@ -216,15 +216,17 @@ def closure() -> Closure:
     return Closure()
 
 
-@pytest.mark.parametrize("seed", [4, 6, 9])
-def test_a_loop_that_closes_moves_the_graph_and_not_the_path(closure: Closure, seed: int) -> None:
+@pytest.mark.parametrize(("seed", "jump_m"), [(4, 0.3), (6, 0.3), (9, 1.5)])
+def test_a_loop_that_closes_moves_the_graph_and_not_the_path(
+    closure: Closure, seed: int, jump_m: float
+) -> None:
     result = Mission("loop", seed, DRIFT, watchers=[closure]).run(600.0)
     assert result["coverage_judge"] >= 0.99
     assert result["contacts"] <= 2, "it may touch a wall that seemed to stand elsewhere"
     assert result["distance_m"] < 250.0
     print(f"closures {closure.revisions}, largest jump in map {closure.jump_m:.2f} m")
     assert closure.revisions >= 1
-    assert closure.jump_m > 0.3
+    assert closure.jump_m > jump_m
     assert closure.pose_jump_m < 0.2, "odom is continuous"
     assert closure.path_jump_m < 0.7, "the path begins at the robot, before and after"
     assert not closure.lost_breadcrumbs
