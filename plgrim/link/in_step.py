@@ -18,7 +18,7 @@ UNKNOWN_NS = 2**62
 """The lag of what was made from something that the link process has not seen: longer than any limit."""
 _KEPT = 512
 _HISTORY_NS = SECOND_NS // 2
-"""What comes so soon after the first of a topic may be a writer's cache, told at once: of it the newest alone is new."""
+"""What comes so soon after the first of a topic may be a writer's cache, told at once: of it only the newest is new."""
 
 
 @dataclass(slots=True)

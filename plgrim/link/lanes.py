@@ -62,7 +62,11 @@ class Lane:
             queue.clear()
         queue.append(parcel)
         while len(queue) > 1 and _bytes_beside_wholes(queue) > self.limit_bytes:
-            kept = [waiting for waiting in queue if waiting.whole] if name in self.differences else list(queue)[1:]
+            kept = (
+                [waiting for waiting in queue if waiting.whole]
+                if name in self.differences
+                else list(queue)[1:]
+            )
             self.dropped[name] += len(queue) - len(kept)
             queue.clear()
             queue.extend(kept)
@@ -84,7 +88,9 @@ class Lane:
         waits = []
         for name in names:
             bucket = self.topic_budgets.get(name)
-            wait_ns = max(self._held_until.get(name, now_ns) - now_ns, bucket.wait_ns(now_ns) if bucket else 0)
+            wait_ns = max(
+                self._held_until.get(name, now_ns) - now_ns, bucket.wait_ns(now_ns) if bucket else 0
+            )
             if wait_ns <= 0:
                 return self._pop(name), 0
             waits.append(wait_ns)

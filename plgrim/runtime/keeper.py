@@ -3,9 +3,9 @@
 The order is what makes it safe: a step, its record on the disk, and only then its outputs on the wire. Snapshots are
 taken between steps, never inside one.
 
-A stage that acknowledges (`Journaling`) is never begun anew over what it has acknowledged: neither after a crash loop nor
-when nothing can be restored. Until a resumed life has got through its first steps it takes no snapshot, so that both
-generations outlive it; its records go behind those of the life before.
+A stage that acknowledges (`Journaling`) is never begun anew over what it has acknowledged: neither after a crash loop
+nor when nothing can be restored. Until a resumed life has got through its first steps it takes no snapshot, so that
+both generations outlive it; its records go behind those of the life before.
 """
 
 from __future__ import annotations
@@ -189,7 +189,9 @@ class Keeper:
             self._steps_to_go -= 1
             if self._steps_to_go:
                 return
-            self._begin(stage, now)  # before the tries are forgotten: it holds the numbers that they have skipped
+            self._begin(
+                stage, now
+            )  # before the tries are forgotten: it holds the numbers that they have skipped
             self._forget_tries()
         elif self._stopwatch() >= self._due_s:
             self._begin(stage, now)

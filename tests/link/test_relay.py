@@ -33,7 +33,9 @@ def test_a_base_with_an_earlier_clock_is_heard_by_the_link_and_by_the_mission() 
     relay, mission = _relay(), Mailbox("robot", tuple(read_by("mission")))
     first = relay.receive(COMMAND, _command("a", 5_000_000, 1), 0, 0)
     assert first is not None and mission.accept(COMMAND, first, 0)
-    assert relay.receive(COMMAND, _command("old", 4_000, 9), SILENT_NS, 0) is None, "two that speak: the later life"
+    assert relay.receive(COMMAND, _command("old", 4_000, 9), SILENT_NS, 0) is None, (
+        "two that speak: the later life"
+    )
     assert relay.dropped == {"status/command:wrong_sender": 1}
     found = relay.receive(COMMAND, _command("b", 4_000, 10), SILENT_NS + 1, 0)
     assert found is not None and _name(found) == "b"

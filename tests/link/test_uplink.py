@@ -12,7 +12,7 @@ from plgrim.link.routes import COMMANDS, MAPS
 from plgrim.link.uplink import Meters, Uplink
 from schemas.base import Message
 from schemas.contract import Topic
-from schemas.operation import CommandAnswer, CommandKind
+from schemas.operation import CommandAnswer, CommandKind, MissionPhase
 from schemas.topics import ANSWER, GLOBAL_IRM, ODOMETRY
 from tests.link.fakes import global_irm
 from tests.runtime.fake_services import odometry
@@ -25,8 +25,9 @@ def _uplink(lane: str) -> Uplink:
 
 def _answer(number: int) -> CommandAnswer:
     return CommandAnswer(
-        stamp_ns=0, command_id=str(number), kind=CommandKind.STOP, carried_out=True, reason="", phase="explore"
-    )
+        stamp_ns=0, command_id=str(number), kind=CommandKind.STOP, accepted=True, reason="",
+        phase=MissionPhase.EXPLORE, fence_ids=[], fences_version=0,
+    )  # fmt: skip
 
 
 def _take(uplink: Uplink, within_s: float = 2.0) -> bytes:
@@ -44,7 +45,9 @@ def test_answers_of_one_step_all_go() -> None:
     assert [_take(uplink) for _ in range(3)] == [b"0", b"1", b"2"]
 
 
-def test_an_answer_waits_for_its_reader_and_is_counted_when_none_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_waits_for_its_reader_and_is_counted_when_none_comes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     uplink = _uplink(COMMANDS)
     uplink.offer(ANSWER, b"a", _answer(0))
     parcel = uplink._next()
@@ -57,7 +60,9 @@ def test_an_answer_waits_for_its_reader_and_is_counted_when_none_comes(monkeypat
     assert uplink.counts() == (0.0, {"mission/answer:link_queue_full": 1})
 
 
-@pytest.mark.parametrize(("topic", "message"), [(ODOMETRY, odometry(0, 0.0)), (GLOBAL_IRM, global_irm(0, 2, 1))])
+@pytest.mark.parametrize(
+    ("topic", "message"), [(ODOMETRY, odometry(0, 0.0)), (GLOBAL_IRM, global_irm(0, 2, 1))]
+)
 def test_what_is_said_anew_is_not_kept_for_nobody(topic: Topic[Message], message: Message) -> None:
     uplink = _uplink(MAPS if topic is GLOBAL_IRM else COMMANDS)
     uplink.offer(topic, b"x", message)

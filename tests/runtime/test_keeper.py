@@ -136,7 +136,9 @@ def test_what_is_acknowledged_is_not_written_over_by_a_stage_that_cannot_restore
     first = _keeper(tmp_path, Watch())
     _live(first, first.recover(Counter, 0), 4)
     for _ in range(3):
-        with pytest.raises(JournalError, match=r"no state of mission leads on.*mission.tries.*mission\.\*\.sqlite"):
+        with pytest.raises(
+            JournalError, match=r"no state of mission leads on.*mission.tries.*mission\.\*\.sqlite"
+        ):
             _keeper(tmp_path, Watch()).recover(lambda: Counter(refuses=(b"0",)), 10)
     assert _keeper(tmp_path, Watch()).recover(Counter, 10).count == 4
 
