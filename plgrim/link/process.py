@@ -147,9 +147,8 @@ class LinkProcess:
         if instance:
             self._arbitrate(instance, topic, payload)
             return
-        stamp = self._service.clock.now_ns()
         with self._lock:  # as in `_arbitrate`: in the order of their sequence numbers
-            sealed = self._relay.receive(topic, payload, time.monotonic_ns(), stamp)
+            sealed = self._relay.receive(topic, payload, time.monotonic_ns())
             if sealed is not None:
                 self._publish([(topic, sealed)])
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from plgrim.runtime.mailbox import Mailbox
 from schemas.base import Message
 from schemas.codec import Envelope, encode
-from schemas.contract import Stamp, Topic
+from schemas.contract import Topic
 
 
 @dataclass(slots=True)
@@ -30,10 +30,10 @@ class Relay:
     _taken_ns: dict[str, int] = field(default_factory=dict)
     _sequence: Counter[str] = field(default_factory=Counter)
 
-    def receive(self, topic: Topic[Message], payload: bytes, now_ns: int, stamp: Stamp) -> bytes | None:
+    def receive(self, topic: Topic[Message], payload: bytes, now_ns: int) -> bytes | None:
         """The message as it goes to the robot's readers; None, counted, when it is refused.
 
-        now_ns: local monotonic clock. stamp: mission clock, for the envelope.
+        now_ns: local monotonic clock. The time of sending stays the writer's.
         """
         writer = topic.writer
         mailbox = self._mailboxes.get(writer)
@@ -46,5 +46,5 @@ class Relay:
         (received,) = mailbox.inputs(now_ns).messages[topic.name][-1:]
         mailbox.stepped()
         self._sequence[topic.name] += 1
-        envelope = Envelope(self.robot, writer, self.epoch, self._sequence[topic.name], stamp)
+        envelope = Envelope(self.robot, writer, self.epoch, self._sequence[topic.name], received.sent_ns)
         return encode(received.message, envelope)

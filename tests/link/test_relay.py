@@ -31,13 +31,13 @@ def _name(payload: bytes) -> str:
 def test_a_base_with_an_earlier_clock_is_heard_by_the_link_and_by_the_mission() -> None:
     """It was replaced, or wiped: its lives are earlier than those that the robot has heard of."""
     relay, mission = _relay(), Mailbox("robot", tuple(read_by("mission")))
-    first = relay.receive(COMMAND, _command("a", 5_000_000, 1), 0, 0)
+    first = relay.receive(COMMAND, _command("a", 5_000_000, 1), 0)
     assert first is not None and mission.accept(COMMAND, first, 0)
-    assert relay.receive(COMMAND, _command("old", 4_000, 9), SILENT_NS, 0) is None, (
+    assert relay.receive(COMMAND, _command("old", 4_000, 9), SILENT_NS) is None, (
         "two that speak: the later life"
     )
     assert relay.dropped == {"status/command:wrong_sender": 1}
-    found = relay.receive(COMMAND, _command("b", 4_000, 10), SILENT_NS + 1, 0)
+    found = relay.receive(COMMAND, _command("b", 4_000, 10), SILENT_NS + 1)
     assert found is not None and _name(found) == "b"
     assert mission.accept(COMMAND, found, 0), mission.last_refusal
 
@@ -45,7 +45,7 @@ def test_a_base_with_an_earlier_clock_is_heard_by_the_link_and_by_the_mission() 
 def test_its_messages_keep_their_order_and_come_once() -> None:
     relay, mission = _relay(), Mailbox("robot", tuple(read_by("mission")))
     for number, (epoch, sequence) in enumerate([(7, 1), (7, 2), (7, 2), (8, 1), (7, 3)]):
-        found = relay.receive(COMMAND, _command(str(number), epoch, sequence), number * SECOND_NS, 42)
+        found = relay.receive(COMMAND, _command(str(number), epoch, sequence), number * SECOND_NS)
         if found is not None:
             assert mission.accept(COMMAND, found, 0), mission.last_refusal
     got = [received.message for received in mission.inputs(0).messages[COMMAND.name]]
@@ -56,12 +56,12 @@ def test_its_messages_keep_their_order_and_come_once() -> None:
 def test_the_next_life_of_the_link_follows_the_last() -> None:
     mission = Mailbox("robot", tuple(read_by("mission")))
     for epoch in (1000, 2000):
-        found = _relay(epoch).receive(COMMAND, _command("a", 7, 1), 0, 0)
+        found = _relay(epoch).receive(COMMAND, _command("a", 7, 1), 0)
         assert found is not None and mission.accept(COMMAND, found, 0), mission.last_refusal
 
 
 def test_what_is_foreign_or_damaged_is_refused_and_counted() -> None:
     relay = _relay()
-    assert relay.receive(COMMAND, _command("a", 1, 1, robot="other"), 0, 0) is None
-    assert relay.receive(COMMAND, b"\xc1Zdamaged", 0, 0) is None
+    assert relay.receive(COMMAND, _command("a", 1, 1, robot="other"), 0) is None
+    assert relay.receive(COMMAND, b"\xc1Zdamaged", 0) is None
     assert relay.dropped == {"status/command:wrong_sender": 1, "status/command:malformed": 1}
