@@ -234,7 +234,7 @@ def is_rough(sim: Mapping[str, Any]) -> bool:
 
 PAPER: Mapping[str, Mapping[str, Any]] = {
     "lcp": {"rollout_random": 1.0, "macros": False},
-    "gcp": {"switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0},
+    "gcp": {"solver": "qmdp", "switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0},
     "reconciler": {"profile": "paper"},
 }
 """`planner: paper`: uniform rollouts and single moves in the POMCP, the QMDP's best frontier at every step, tau* by

@@ -29,8 +29,10 @@ BUILT_IN_VARIANTS: Mapping[str, Overlay] = {
     "paper": {"planner": "paper"},
     "uniform_rollouts": {"lcp": {"rollout_random": 1.0}},
     "single_moves": {"lcp": {"macros": False}},
-    "best_frontier": {"gcp": {"switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0}},
-    "orienteering": {"gcp": {"solver": "orienteering"}},
+    "best_frontier": {
+        "gcp": {"solver": "qmdp", "switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0}
+    },
+    "qmdp": {"gcp": {"solver": "qmdp"}},
     "literal_tau": {"reconciler": {"profile": "paper"}},
     "risk_blind": {
         "riskmap": {"risk_blind": True},

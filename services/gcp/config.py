@@ -41,15 +41,27 @@ class Config(BaseModel):
     latency_s: float = Field(0.05, ge=0, le=10, description="Lock-step: time that a step takes, s.")
     reward: RewardWeights = RewardWeights()
     solver: Literal["qmdp", "orienteering", "hfe"] = Field(
-        "qmdp",
-        description="The paper's QMDP; the best order in which to visit all frontiers (after FIG-OP); or hfe, the "
-        "paper's frontier-based baseline.",
+        "orienteering",
+        description="qmdp: the paper's; orienteering: the best order in which to visit all frontiers (after FIG-OP); "
+        "hfe: the paper's frontier-based baseline.",
     )
     hfe: HfeConfig = HfeConfig()
     group_m: float = Field(
         4.0, ge=0, le=50, description="Frontiers so near to one another are one stop (orienteering), m."
     )
     groups: int = Field(16, ge=1, le=64, description="Stops weighed, the nearest ones (orienteering).")
+    near_worth: float = Field(
+        10.0,
+        ge=0,
+        le=1e6,
+        description="When a tour over those is worth less, nats, as many far ones join that promise most for the way.",
+    )
+    tour_gamma_per_m: float = Field(
+        0.995,
+        gt=0,
+        le=1,
+        description="Discount for a metre before a stop of the tour: less is nearer to going where most is at hand.",
+    )
     tour_margin: float = Field(
         2.0, ge=0, le=1000, description="The target is left for a tour that is better by this, nats, and"
     )

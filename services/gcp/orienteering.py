@@ -20,6 +20,8 @@ from services.gcp.roadnet import RoadNet
 
 _NEXT_OF_GROUP = 0.3
 """Frontiers of a group mostly look at the same unseen ground: the best one counts whole, the others so much."""
+_NEAR_COST = 0.5
+"""Ways that cost less are equally near when gain is weighed by cost, nats: ten metres."""
 
 
 class Groups(NamedTuple):
@@ -180,45 +182,64 @@ def best_tour(gain: Floats, legs: Legs, first: int = -1) -> Tour:
 
 
 def group_frontiers(
-    roads: RoadNet, frontiers: Slots, away: Floats, apart_m: float, most: int, keep: int
+    roads: RoadNet, frontiers: Slots, away: Floats, apart_m: float, most: int, keep: int, far: int = 0
 ) -> Groups:
-    """The groups of the nearest frontiers. away: (f,) cost of the way to each, inf without one. keep: a slot, or -1.
+    """The `most` nearest groups of frontiers, and of the others the `far` that promise most for the way there.
 
-    A frontier joins the group whose best frontier is within `apart_m` of it, straight; the frontier `keep` stands for
-    its group.
+    away: (f,) cost of the way to each, inf without one. keep: a slot, or -1. A frontier joins the group whose first
+    frontier is within `apart_m` of it, straight; the frontier `keep` stands for its group.
     """
     order = np.lexsort((roads.net.node_id[frontiers], away))
     order = order[np.isfinite(away[order])]
-    best: list[int] = [keep] if keep in frontiers[order] else []
-    members: list[list[int]] = [[] for _ in best]
-    of: dict[int, int] = {}
-    for slot in frontiers[order].tolist():
-        gap_m = [float(np.linalg.norm(roads.xyz_m[slot] - roads.xyz_m[b])) for b in best]
-        group = int(np.argmin(gap_m)) if gap_m and min(gap_m) <= apart_m else -1
+    slots, cost = frontiers[order].tolist(), away[order]
+    first: list[int] = [keep] if keep in slots else []
+    members: list[list[int]] = [[] for _ in first]
+    costs = [float(cost[slots.index(keep)])] if first else []
+    places = np.empty((len(slots) + 1, 3))
+    places[: len(first)] = roads.xyz_m[first]
+    for slot, to_it in zip(slots, cost.tolist(), strict=True):
+        gap_m = np.linalg.norm(places[: len(members)] - roads.xyz_m[slot], axis=1)
+        group = int(np.argmin(gap_m)) if gap_m.size and gap_m.min() <= apart_m else -1
         if group < 0:
-            if len(best) >= most:
+            if far == 0 and len(members) >= most:
                 continue
-            best.append(slot)
+            group = len(members)
+            places[group] = roads.xyz_m[slot]
             members.append([])
-            group = len(best) - 1
-        of[slot] = group
+            costs.append(to_it)
         members[group].append(slot)
     gain = roads.net.gain
-    for k, slots in enumerate(members):
-        if best[k] != keep:
-            best[k] = max(slots, key=lambda s: (gain[s], -roads.net.node_id[s]))
-    total = [
-        (1.0 - _NEXT_OF_GROUP) * max(gain[s] for s in slots) + _NEXT_OF_GROUP * sum(gain[s] for s in slots)
-        for slots in members
-    ]
-    return Groups(np.array(best, np.int32), np.array(total, np.float64), of)
+    total = np.array([_promise(gain[group]) for group in members])
+    chosen = _worth_going(total, np.array(costs), most, far)
+    best = [max(members[k], key=lambda s: (gain[s], -roads.net.node_id[s])) for k in chosen]
+    best[: len(first)] = first
+    of = {slot: k for k, group in enumerate(chosen) for slot in members[group]}
+    return Groups(np.array(best, np.int32), total[chosen], of)
+
+
+def _promise(gain: Floats) -> float:
+    """What a group of frontiers promises, from the gain of each."""
+    return float((1.0 - _NEXT_OF_GROUP) * gain.max() + _NEXT_OF_GROUP * gain.sum())
+
+
+def _worth_going(gain: Floats, cost: Floats, most: int, far: int) -> list[int]:
+    """The first `most` groups, and of the others the `far` with the most gain for their cost."""
+    others = np.arange(min(most, gain.size), gain.size)
+    rate = gain[others] / (cost[others] + _NEAR_COST)
+    chosen = others[np.argsort(-rate, kind="stable")[:far]]
+    return [*range(min(most, gain.size)), *sorted(chosen.tolist())]
 
 
 class Visits:
-    """The tour from the robot's node. gamma_per_m: of the reward."""
+    """The tour from the robot's node over the nearest groups, `most` of them; when that is worth less than `near_worth`
+    (nats), over as many far ones too. gamma_per_m: discount of gains and costs by the way driven before.
+    """
 
-    def __init__(self, roads: RoadNet, gamma_per_m: float, apart_m: float, most: int) -> None:
+    def __init__(
+        self, roads: RoadNet, gamma_per_m: float, apart_m: float, most: int, near_worth: float
+    ) -> None:
         self._roads, self._gamma, self._apart_m, self._most = roads, gamma_per_m, apart_m, most
+        self._near_worth = near_worth
 
     def first(self, start: int, held: int) -> Outlook:
         """Where to begin. start: the robot's slot. held: slot of the frontier that is the target, or -1."""
@@ -227,7 +248,14 @@ class Visits:
         if frontiers.size == 0:
             return Outlook()
         away, _ = self._ways(start, frontiers)
-        groups = group_frontiers(roads, frontiers, away, self._apart_m, self._most, held)
+        outlook = self._over(start, held, frontiers, away, 0)
+        if outlook.value < self._near_worth:
+            outlook = self._over(start, held, frontiers, away, self._most)
+        return outlook
+
+    def _over(self, start: int, held: int, frontiers: Slots, away: Floats, far: int) -> Outlook:
+        """The tour over the nearest groups and `far` of the others."""
+        groups = group_frontiers(self._roads, frontiers, away, self._apart_m, self._most, held, far)
         if groups.slot.size == 0:
             return Outlook()
         legs = self._legs(start, groups.slot)

@@ -70,7 +70,7 @@ class GcpStage:
         self._roads = RoadNet(config.reward)
         self._planner = GlobalPlanner(self._roads)
         self._visits = (
-            Visits(self._roads, config.reward.gamma_per_m, config.group_m, config.groups)
+            Visits(self._roads, config.tour_gamma_per_m, config.group_m, config.groups, config.near_worth)
             if config.solver == "orienteering"
             else None
         )

@@ -103,7 +103,7 @@ class Config(BaseModel):
         0.04, ge=0, le=10, description="UCB constant, in units of the range of returns."
     )
     horizon: int = Field(
-        40, ge=1, le=500, description="Moves of every simulation, tree and rollout together."
+        70, ge=1, le=500, description="Moves of every simulation, tree and rollout together."
     )
     rollout_random: float = Field(
         0.1,

@@ -122,4 +122,5 @@ def model_at(
         weights=parameters(config.weights),
         horizon=config.horizon,
         rollout_random=config.rollout_random,
+        macros=config.macros,
     )

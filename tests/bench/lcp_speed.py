@@ -20,6 +20,8 @@ from plgrim.evaluation.bare_walk import bare_walk, search_bare_walk
 from services.lcp.config import Config
 from tests.bench.coverage_worlds import SIZE, World, model_at, random_world
 
+HORIZON = 40
+
 
 def solver(config: Config, workers: int = 1) -> Pomcp:
     """A solver as lcp has it."""
@@ -45,12 +47,14 @@ def measure(
     rounds: int, simulations: int, fov_deg: float, reach: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(processor seconds, wall seconds), each (rounds, 3): coverage, bare walk, coverage by two threads."""
-    config = Config()
+    config = Config(horizon=HORIZON)
     alone, walk, pair = solver(config), solver(config), solver(config, workers=2)
     cpu, wall = np.zeros((rounds, 3)), np.zeros((rounds, 3))
     for k in range(-1, rounds):
         world = random_world(1000 + k, reach=reach, risky_share=0.1, seen=True)
-        model = model_at(world, world.start, 0, entropy=after_a_look(world, fov_deg), fov_deg=fov_deg)
+        model = model_at(
+            world, world.start, 0, entropy=after_a_look(world, fov_deg), fov_deg=fov_deg, config=config
+        )
         bare = bare_walk(model)
         searches: tuple[Callable[[], object], ...] = (
             lambda model=model, k=k: alone.search(search_coverage, model, seed=k, simulations=simulations),  # type: ignore[misc]
@@ -78,7 +82,7 @@ def main() -> None:
     rate = options.simulations / cpu[:, :2] / 1e3
     share = cpu[:, 1] / cpu[:, 0]
     print(
-        f"POMCP on the Local IRM, horizon 40, footprint radius {options.reach}, {options.fov_deg:.0f} deg, "
+        f"POMCP on the Local IRM, horizon {HORIZON}, footprint radius {options.reach}, {options.fov_deg:.0f} deg, "
         f"{options.simulations} simulations a search, {options.rounds} worlds (medians):"
     )
     print(

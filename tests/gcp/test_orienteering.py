@@ -11,7 +11,16 @@ from hypothesis import strategies as st
 
 from planning.reward import RewardWeights
 from schemas.topics import GLOBAL_IRM
-from services.gcp.orienteering import Legs, Outlook, Visits, best_tour, improve, tour_value, ways_from
+from services.gcp.orienteering import (
+    Legs,
+    Outlook,
+    Visits,
+    best_tour,
+    group_frontiers,
+    improve,
+    tour_value,
+    ways_from,
+)
 from services.gcp.roadnet import RoadNet
 from tests.gcp.test_stage import CRUMB, FRONTIER, Bench, Node, graph
 
@@ -93,7 +102,7 @@ def test_a_small_opening_on_the_way_comes_before_the_large_one_far_away() -> Non
     }  # fmt: skip
     edges = {(1, 2): (10.0, 0.0), (2, 3): (10.0, 0.0), (1, 10): (6.0, 0.0), (3, 11): (20.0, 0.0)}
     roads = road(nodes, edges)
-    look = Visits(roads, GAMMA, 4.0, 16).first(roads.slot_of(1), -1)
+    look = Visits(roads, GAMMA, 4.0, 16, 0.0).first(roads.slot_of(1), -1)
     assert roads.net.node_id[look.first] == 10
     assert look.kept_value == -np.inf
     qmdp, tour = Bench(), Bench(solver="orienteering")
@@ -120,9 +129,30 @@ def test_frontiers_side_by_side_are_one_stop_and_what_cannot_be_reached_is_none(
         nodes[10 + k] = (FRONTIER, 8.0, 0.5 * k, 3.0)
         edges[1, 10 + k] = (8.0, 0.0)
     roads = road(nodes, edges)
-    look = Visits(roads, GAMMA, 4.0, 16).first(roads.slot_of(1), roads.slot_of(12))
+    look = Visits(roads, GAMMA, 4.0, 16, 0.0).first(roads.slot_of(1), roads.slot_of(12))
     gain = 3.0 + 0.3 * 12.0
     assert look.value == pytest.approx(GAMMA**8 * gain - 0.05 * 8.0)
     assert look.kept_value == pytest.approx(look.value)
-    assert Visits(road({1: nodes[1]}, {}), GAMMA, 4.0, 16).first(0, -1) == Outlook()
-    assert Visits(road({1: nodes[1], 9: nodes[9]}, {}), GAMMA, 4.0, 16).first(0, -1) == Outlook()
+    assert Visits(road({1: nodes[1]}, {}), GAMMA, 4.0, 16, 0.0).first(0, -1) == Outlook()
+    assert Visits(road({1: nodes[1], 9: nodes[9]}, {}), GAMMA, 4.0, 16, 0.0).first(0, -1) == Outlook()
+
+
+@pytest.mark.parametrize("near_worth", [-1000.0, 10.0])
+def test_slivers_at_hand_do_not_hide_the_field_far_away(near_worth: float) -> None:
+    """Twenty leftovers of 0.4 nats lie around the robot, a field of five openings of 20 nats 150 m away."""
+    nodes: dict[int, Node] = {1: (CRUMB, 0.0, 0.0, 0.0), 2: (CRUMB, 150.0, 0.0, 0.0)}
+    edges = {(1, 2): (150.0, 0.0)}
+    for k in range(20):
+        nodes[10 + k] = (FRONTIER, 0.0, 10.0 + 6.0 * k, 0.4)
+        edges[1, 10 + k] = (10.0 + 6.0 * k, 0.0)
+    for k in range(5):
+        nodes[31 + k] = (FRONTIER, 150.0, 5.0 + 8.0 * k, 20.0)
+        edges[2, 31 + k] = (5.0 + 8.0 * k, 0.0)
+    roads = road(nodes, edges)
+    look = Visits(roads, 0.995, 4.0, 16, near_worth).first(roads.slot_of(1), -1)
+    assert (roads.net.node_id[look.first] == 31) == (near_worth > 0.0)
+    near = group_frontiers(roads, roads.frontier_slots(), np.arange(25.0), 4.0, 3, -1, 2)
+    assert roads.net.node_id[near.slot].tolist() == [10, 11, 12, 31, 32], (
+        "the nearest, then the most for the way"
+    )
+    assert near.of[roads.slot_of(32)] == 4

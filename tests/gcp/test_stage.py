@@ -95,10 +95,10 @@ def mission(
 
 
 class Bench:
-    """Steps a stage; messages given are fresh, odometry stands at 0 unless given."""
+    """Steps a stage, with the QMDP unless told otherwise; messages are fresh, odometry stands at 0 unless given."""
 
     def __init__(self, **config: Any) -> None:
-        self.stage = GcpStage(Config.model_validate(config), StageSetup("husky1", 7))
+        self.stage = GcpStage(Config.model_validate({"solver": "qmdp", **config}), StageSetup("husky1", 7))
         self.now = 0
         self.requests = 0
 
