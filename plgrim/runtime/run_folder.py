@@ -46,8 +46,10 @@ def with_fresh_state(config: Config, run_folder: Path) -> Config:
 
 def refuse_unfinished(folder: Path) -> None:
     """A mission that has not ended is not written over. Raises ConfigError when its journals are in this run folder,
-    AlreadyRunningError when a supervisor is at work in it.
+    AlreadyRunningError when a supervisor is at work in it. A folder that is not there is not made.
     """
+    if not folder.exists():
+        return
     lock = lock_run_folder(folder)
     try:
         if state := _journals(folder):

@@ -2,9 +2,9 @@
 
 After FIG-OP (Peltzer et al. 2022, arXiv 2203.06316): the QMDP weighs each frontier as if it were the only goal, and
 drives by a small opening on the way to a large one far away, to come back for it later. Here the order of the visits
-counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the part of risk
-in the paper's cost of a leg. The way itself counts by what it delays: all is to be visited, and a discounted cost of
-the way would be a reason to put off the long leg, for whatever crumb is nearer.
+counts: V = sum over k of gamma^D_k S_k gain_k, with D the distance driven so far and S the probability that nothing
+fails on the way so far. Ways and risks count by what they delay and endanger: all is to be visited, and a discounted
+cost would be a reason to put off the long leg, for whatever crumb is nearer.
 """
 
 from __future__ import annotations
@@ -35,17 +35,16 @@ class Groups(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """Legs of a tour: cost (of risk), discount (gamma^distance), way: what the distance itself costs, (k + 1, k): row k
-    from the robot. inf, 0 and 0 without a way.
+    """Legs of a tour: cost (the paper's), discount: gamma^distance (1 - rho), (k + 1, k): row k from the robot. inf
+    and 0 without a way.
     """
 
     cost: Floats
     discount: Floats
-    way: Floats
 
 
 class Tour(NamedTuple):
-    """An order of the groups and its value, and less what the way costs: net; empty when none can be reached."""
+    """An order of the groups and its value, and less what the legs cost: net; empty when none can be reached."""
 
     order: NDArray[np.int64]
     value: float
@@ -96,16 +95,25 @@ def ways_from(
 
 
 @njit
-def tour_value(order: NDArray[np.int64], gain: Floats, cost: Floats, discount: Floats) -> float:
+def tour_value(order: NDArray[np.int64], gain: Floats, discount: Floats) -> float:
     """The value of visiting the groups in this order."""
     at, left, value = gain.shape[0], 1.0, 0.0
     for k in range(order.shape[0]):
-        stop = order[k]
-        value -= left * cost[at, stop]
-        left *= discount[at, stop]
-        value += left * gain[stop]
-        at = stop
+        left *= discount[at, order[k]]
+        at = order[k]
+        value += left * gain[at]
     return value
+
+
+@njit
+def tour_cost(order: NDArray[np.int64], cost: Floats, discount: Floats) -> float:
+    """What the legs cost, each discounted by those before it."""
+    at, left, total = cost.shape[1], 1.0, 0.0
+    for k in range(order.shape[0]):
+        total += left * cost[at, order[k]]
+        left *= discount[at, order[k]]
+        at = order[k]
+    return total
 
 
 @njit
@@ -123,10 +131,10 @@ def _move(order: NDArray[np.int64], i: int, j: int, turned: NDArray[np.int64]) -
 
 
 @njit
-def improve(order: NDArray[np.int64], fixed: int, gain: Floats, cost: Floats, discount: Floats) -> float:
+def improve(order: NDArray[np.int64], fixed: int, gain: Floats, discount: Floats) -> float:
     """Move single stops and turn stretches round, as long as it helps, in place. The first `fixed` stops stay."""
     n = order.shape[0]
-    best = tour_value(order, gain, cost, discount)
+    best = tour_value(order, gain, discount)
     trial = order.copy()
     better = True
     while better:
@@ -143,7 +151,7 @@ def improve(order: NDArray[np.int64], fixed: int, gain: Floats, cost: Floats, di
                         trial[i : j + 1] = order[i : j + 1][::-1]
                     else:
                         continue
-                    value = tour_value(trial, gain, cost, discount)
+                    value = tour_value(trial, gain, discount)
                     if value > best + 1e-9:
                         order[:] = trial
                         best, better = value, True
@@ -164,7 +172,7 @@ def _greedy(
         best, value = -1, -np.inf
         for k in range(n):
             if not used[k] and cost[at, k] < np.inf:
-                q = discount[at, k] * gain[k] - cost[at, k]
+                q = discount[at, k] * gain[k]
                 if q > value:
                     best, value = k, q
         if best < 0:
@@ -178,13 +186,13 @@ def best_tour(gain: Floats, legs: Legs, first: int = -1) -> Tour:
 
     By local search (moves of single stops, turns of stretches) from the greedy order.
     """
-    cost, discount, way = legs
+    cost, discount = legs
     reached = np.isfinite(cost[-1])
     if not reached.any() or (first >= 0 and not reached[first]):
         return Tour(np.zeros(0, np.int64), -np.inf)
     order = _greedy(first, reached, gain, cost, discount)
-    value = improve(order, 1 if first >= 0 else 0, gain, cost, discount)
-    return Tour(order, float(value), float(tour_value(order, gain, cost + way, discount)))
+    value = improve(order, 1 if first >= 0 else 0, gain, discount)
+    return Tour(order, value, value - tour_cost(order, cost, discount))
 
 
 def group_frontiers(
@@ -287,11 +295,12 @@ class Visits:
 
     def _legs(self, start: int, stops: Slots) -> Legs:
         shape, w = (stops.size + 1, stops.size), self._roads.weights
-        cost, discount, way = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
+        cost, discount = np.full(shape, np.inf), np.zeros(shape)
         for row, source in enumerate([*stops.tolist(), start]):
-            total, distance_m = self._ways(source, stops)
-            reached = np.isfinite(total)
-            way[row, reached] = w.k_cost * w.k_distance_per_m * distance_m[reached]
-            cost[row, reached] = np.maximum(total - way[row], 0.0)[reached]
-            discount[row, reached] = self._gamma ** distance_m[reached]
-        return Legs(cost, discount, way)
+            cost[row], distance_m = self._ways(source, stops)
+            reached = np.isfinite(cost[row])
+            of_risk = np.maximum(cost[row] - w.k_cost * w.k_distance_per_m * distance_m, 0.0)
+            # A way's cost has the sum of its edges' rho: all of them hold with about exp(-sum).
+            failing = of_risk / max(w.k_cost * w.k_risk, 1e-9) if w.k_risk > 0.0 else np.zeros(stops.size)
+            discount[row, reached] = self._gamma ** distance_m[reached] * np.exp(-failing[reached])
+        return Legs(cost, discount)
