@@ -90,6 +90,9 @@ class RuntimeConfig(_Section):
     stuck_after_s: float = Field(10.0, gt=0)
     """A service whose step does not end for so long is killed and restarted. It is flagged as late, and not ready,
     after 2.5 of its periods."""
+    watchdog: bool = False
+    """Where nobody watches a service, as in a container: it ends itself `stuck_after_s` after it was last seen to make
+    steps and heartbeats, so that it is started anew. A supervisor's own services leave that to it."""
     hold_failed_s: float = Field(0.0, ge=0)
     """A service that has used up its restarts is FAILED, and the robot holds: end the run after so long. 0: never,
     until somebody does; `explore` and `demo` take 10 s then."""

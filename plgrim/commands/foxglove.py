@@ -13,8 +13,8 @@ from plgrim.commands.options import ConfigFile
 
 def foxglove(
     host: Annotated[
-        str, typer.Option(help="Where to listen; there is no authentication: keep it on this host.")
-    ] = ("127.0.0.1"),
+        str, typer.Option(help="Where to listen, on this host alone: there is no authentication.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Of the WebSocket.")] = 8765,
     recording: Annotated[
         Path | None, typer.Option(help="Show this recording instead of a running system.")
@@ -29,9 +29,11 @@ def foxglove(
     from plgrim.logs import configure_logs
     from plgrim.recording.foxglove_view import FoxgloveServer, show_live, show_recording
     from plgrim.runtime.process import stop_on_signals
+    from plgrim.security.exposure import check_listen
 
     configure_logs("foxglove")
     config = load_config(config_file)
+    check_listen(host, config)
     server = FoxgloveServer(host, port)
     print(
         f"Foxglove: open connection ws://{host}:{server.port}, layout docs/foxglove_layout.json", flush=True

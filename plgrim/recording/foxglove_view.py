@@ -28,7 +28,10 @@ from schemas.topics import SERVICES, TOPICS, health_topic, topic_named
 
 
 class FoxgloveServer:
-    """A Foxglove WebSocket server with a channel a topic. Raises PortTakenError, and PlgrimError without the extra."""
+    """A Foxglove WebSocket server with a channel a topic. Raises PortTakenError, and PlgrimError without the extra.
+
+    Its protocol has neither TLS nor tokens here: check the address first (`check_listen`).
+    """
 
     def __init__(self, host: str, port: int) -> None:
         self._sdk = _sdk()

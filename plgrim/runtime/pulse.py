@@ -31,12 +31,14 @@ class Reading:
 
 
 class Pulse:
-    """The writing side; without a file it does nothing."""
+    """The writing side; without a file only the process itself can read it."""
 
     def __init__(self, path: Path | None) -> None:
         """path: made if need be. OSError when it cannot be written."""
-        self._words: memoryview | None = None
+        self.supervised = path is not None
         if path is None:
+            self._words = memoryview(bytearray(_WORDS.size)).cast("q")
+            self._words[0] = os.getpid()
             return
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
         try:
@@ -57,29 +59,29 @@ class Pulse:
         except OSError:
             return cls(None)
 
+    def reading(self) -> Reading:
+        """What it says now."""
+        return Reading(*self._words)
+
     def expect(self, period_s: float) -> None:
         """From now on a step ends at least once in `period_s` wall seconds."""
-        if self._words is not None:
-            self._words[1] = max(1, round(period_s * 1e9))
+        self._words[1] = max(1, round(period_s * 1e9))
 
     def stepped(self) -> None:
         """A step has ended."""
-        if self._words is not None:
-            self._words[2] += 1
+        self._words[2] += 1
 
     def beat(self) -> None:
         """The heartbeat's thread was here."""
-        if self._words is not None:
-            self._words[3] += 1
+        self._words[3] += 1
 
     def compiling(self, more: int) -> None:
         """One more kernel (1) or one less (-1) is being compiled now; they nest."""
-        if self._words is not None:
-            self._words[4] += more
+        self._words[4] += more
 
     def listen_to_numba(self) -> None:
         """Note when numba compiles; not when it loads what was compiled before. For a stage that uses it."""
-        if self._words is None or "numba" not in sys.modules:
+        if "numba" not in sys.modules:
             return
         from numba.core import event
 

@@ -18,6 +18,7 @@ from plgrim.runtime.health import HealthMonitor, Heartbeat, query_key, token_key
 from plgrim.runtime.keeper import next_epoch
 from plgrim.runtime.mailbox import Outbox
 from plgrim.runtime.pulse import Pulse
+from plgrim.runtime.watchdog import Watchdog
 from plgrim.runtime.zenoh_session import Link, connect
 from plgrim.security.exposure import check_client
 from schemas.contract import Output, Stamp
@@ -56,6 +57,9 @@ class LiveService:
         except BaseException:
             self.link.close()
             raise
+        pulse = self.monitor.pulse
+        ends_after_s = config.runtime.stuck_after_s if config.runtime.watchdog else 0.0
+        self._watchdog = None if pulse.supervised else Watchdog(pulse, ends_after_s)
         self._heartbeat = Heartbeat(config.runtime.health_period_s, self._beat)
 
     def __enter__(self) -> LiveService:
@@ -65,6 +69,8 @@ class LiveService:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._heartbeat.stop()
+        if self._watchdog is not None:
+            self._watchdog.stop()
         self.link.close()
 
     def _refuse_second_instance(self) -> None:
@@ -104,6 +110,8 @@ class LiveService:
 
     def _beat(self) -> None:
         self.monitor.pulse.beat()
+        if self._watchdog is not None:
+            self._watchdog.beat(self.monitor.ready)
         topic = health_topic(self.name)
         try:
             self._last = self._outbox.pack(Output(topic, self.health()), self.clock.now_ns(), self.knows())

@@ -146,10 +146,11 @@ def _rules(process: str, given: Grant) -> list[dict[str, Any]]:
         # As a reader.
         _rule("subscribes", "ingress", ["declare_subscriber"], reads + _below(reads)),
         _rule("gets", "egress", ["put"], reads + _below(reads)),
-        _rule("asks", "ingress", ["query"], reads + _below(reads) + list(given.asks)),
-        _rule(
-            "is_answered", "egress", ["declare_queryable", "reply"], reads + _below(reads) + list(given.asks)
-        ),
+        # Of what it reads it may ask for cached and missed samples alone: a query on a key itself may be a command, and
+        # who reads everything would give it. The samples come back under the keys of their topics.
+        _rule("asks", "ingress", ["query"], _below(reads) + list(given.asks)),
+        _rule("is_offered", "egress", ["declare_queryable"], _below(reads) + list(given.asks)),
+        _rule("is_answered", "egress", ["reply"], reads + _below(reads) + list(given.asks)),
         # Liveliness tokens.
         _rule("lives", "ingress", ["liveliness_token"], _below(puts) + list(given.declares)),
         _rule(

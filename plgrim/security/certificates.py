@@ -33,8 +33,9 @@ CERTIFICATE, KEY, TRUSTED = "cert.pem", "key.pem", "trusted.pem"
 """The files of a process: its certificate with the issuer's, its key (0600), the issuers that it trusts."""
 _CA, _CA_KEY, _INDEX = "ca.pem", "ca.key", "issued.json"
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,32}(\.[A-Za-z0-9_-]{1,32}){0,3}")
-_BACKDATED = dt.timedelta(days=1)
-"""A robot without a battery-backed clock may be behind."""
+_NOT_BEFORE = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+"""A robot without a battery-backed clock may start at zero, and its processes must find one another all the same. That
+a certificate has begun protects nothing: what bounds it are its end and `trusted.pem`."""
 
 
 class CertificateError(ConfigError):
@@ -245,7 +246,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _BACKDATED)
+        .not_valid_before(min(now, _NOT_BEFORE))
         .not_valid_after(now + dt.timedelta(days=days))
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
     )

@@ -9,6 +9,7 @@ from plgrim.errors import ConfigError
 from plgrim.hosts import SECURE, is_local, options, protocol
 from plgrim.security.access import TOOLS
 from plgrim.security.certificates import CERTIFICATE, KEY, TRUSTED, CertificateError, check_private
+from schemas.hosts import is_loopback
 from schemas.topics import LINK
 from services.status.config import Config as StatusConfig
 
@@ -53,6 +54,15 @@ def check_link(config: Config) -> None:
         raise ExposedError(f"link.endpoint: {config.link.endpoint} leaves this host {_PLAIN}")
     if protocol(config.link.endpoint) in SECURE:
         certificate_folder(config.router, LINK)
+
+
+def check_listen(host: str, config: Config) -> None:
+    """Refuse an address for a server without TLS and tokens that others can reach. Raises ExposedError."""
+    if not (is_loopback(host) or config.deployment.private_network):
+        raise ExposedError(
+            f"--host {host}: can be reached from other hosts, and there is neither TLS nor a token: whoever comes "
+            "reads maps and plans. Stay on 127.0.0.1; from another computer: ssh -L 8765:127.0.0.1:8765 HOST"
+        )
 
 
 def check_host(config: Config) -> None:

@@ -26,18 +26,20 @@ class Config(BaseModel):
         description="File of tokens, a line each: `viewer NAME SECRET` or `operator NAME SECRET`. See security.py.",
     )
     read_token: Literal["auto", "always"] = Field(
-        "auto", description="auto: reading needs a token unless `host` is loopback; always: everywhere."
+        "auto",
+        description="auto: reading needs a token unless `host` is loopback or `trusted_network`; always: everywhere.",
     )
     tls_certificate_file: str = Field("", description="PEM certificate, for HTTPS. Empty: HTTP.")
     tls_key_file: str = Field("", description="PEM key of the certificate.")
     trusted_network: bool = Field(
         False,
-        description="The network of `host` has no strangers (that of one compose project): no TLS there.",
+        description="The network of `host` has no strangers (that of one compose project): no TLS there, and reading "
+        "is open as on loopback. Not for a network that others can join.",
     )
     allowed_hosts: tuple[str, ...] = Field(
         (),
         description="Names, without port, under which it may be asked, beside those of loopback. None, and `host` is "
-        "not loopback: any.",
+        "neither loopback nor in a `trusted_network`: any.",
     )
     allowed_origins: tuple[str, ...] = Field(
         (), description="Other sites whose pages may change things, as https://desk:8443."

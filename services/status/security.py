@@ -1,9 +1,10 @@
 """Who may ask the status service for what: bearer tokens with roles, and where it may listen.
 
-Reading is open on a loopback address (unless `read_token` is `always`) and needs a token elsewhere; every request that
-changes something needs the token of an operator, everywhere. A browser hands its token in once, in the header of
-`POST /api/v1/session`, and then carries it in a cookie that no script can read: pictures, event streams and WebSockets
-cannot send headers. What a request may look like before anybody reads it is in `guard.py`.
+Reading is open on a loopback address and in a network without strangers (`trusted_network`), unless `read_token` is
+`always`, and needs a token elsewhere; every request that changes something needs the token of an operator,
+everywhere. A browser hands its token in once, in the header of `POST /api/v1/session`, and then carries it in a
+cookie that no script can read: pictures, event streams and WebSockets cannot send headers. What a request may look
+like before anybody reads it is in `guard.py`.
 
 A route is protected by a dependency; an application without `secure` refuses all of them:
 
@@ -73,7 +74,7 @@ class Access:
     def of(cls, config: Config) -> Access:
         """The access that the configuration asks for. Raises SecurityError."""
         tokens = read_tokens(Path(config.tokens_file)) if config.tokens_file else ()
-        return cls(tokens, config.read_token == "auto" and is_loopback(config.host))
+        return cls(tokens, config.read_token == "auto" and _is_private(config))
 
     def who(self, secret: str) -> Token | None:
         """The token with this secret. Takes as long for a wrong secret as for a right one."""
@@ -82,6 +83,11 @@ class Access:
             if hmac.compare_digest(token.digest, digest):
                 found = token
         return found
+
+
+def _is_private(config: Config) -> bool:
+    """Whether only this host's own programs, or a network without strangers, come to where it listens."""
+    return config.trusted_network or is_loopback(config.host)
 
 
 def _digest(secret: str) -> bytes:
@@ -254,7 +260,8 @@ def secure(app: FastAPI, config: Config, access: Access | None = None) -> None:
     app.get(SESSION_PATH, tags=["access"])(session)
     app.post(SESSION_PATH, tags=["access"], responses=refused)(open_session)
     app.delete(SESSION_PATH, tags=["access"], responses=refused)(close_session)
-    named = is_loopback(config.host) or config.allowed_hosts
+    # Where one reads without a token, a browser must not be led here by a foreign name (DNS rebinding).
+    named = _is_private(config) or config.allowed_hosts
     # This host's own programs ask by these names wherever it listens, and no foreign name can be made to be one.
     hosts = ("127.0.0.1", "localhost", "[::1]") if named else ()
     app.add_middleware(

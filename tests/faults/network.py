@@ -23,7 +23,8 @@ from plgrim.runtime.process import child_environment
 from tests.runtime.helpers import REPOSITORY
 
 ROBOT, BASE = "robot", "base"
-_ADDRESS = {ROBOT: "10.77.0.1", BASE: "10.77.0.2"}
+BASE_ADDRESS = "10.77.0.2"
+_ADDRESS = {ROBOT: "10.77.0.1", BASE: BASE_ADDRESS}
 
 
 def _run(*command: str, check: bool = True) -> None:

@@ -18,6 +18,7 @@ from plgrim.errors import NoRouterError
 from plgrim.runtime.router import router_settings
 from plgrim.runtime.zenoh_session import Link, connect
 from plgrim.security.access import (
+    COMMAND_QUERY,
     OPERATOR,
     RECORDER,
     ROBOT_RECORDER,
@@ -227,6 +228,29 @@ def test_the_robots_recorder_hands_out_its_segments_at_the_base_and_no_more(
         _listen(robots, f"{root_of(ROBOT)}/**", ears)
         here.last_words()
         assert ears == []
+
+
+@pytest.mark.parametrize("role", ["all", "base"])
+def test_of_all_processes_the_operator_alone_commands_the_mission(
+    role: Role, certificates_by_role: dict[Role, Path]
+) -> None:
+    """The status service carries out whatever the query brings: who may read everything may not therefore ask it."""
+    command, heard = f"{root_of(ROBOT)}/{COMMAND_QUERY}", []  # type: tuple[str, list[bytes]]
+
+    def carry_out(payload: bytes) -> bytes:
+        heard.append(payload)
+        return b"carried out"
+
+    with host(role, certificates_by_role[role]) as here:
+        here.links["status"].serve(command, carry_out)
+        ask = here.links[OPERATOR].ask
+        eventually(lambda: ask(command, 1.0, b"operator") == b"carried out", "the operator's is carried out")
+        others = [process for process in here.links if process not in (OPERATOR, "status")]
+        for process in others:
+            for key in (command, f"{root_of(ROBOT)}/mission/*", f"{root_of(ROBOT)}/**"):
+                assert here.links[process].ask(key, 0.2, process.encode()) is None, (process, key)
+        assert ask(command, 1.0, b"operator") == b"carried out"
+    assert len(others) > 5 and set(heard) == {b"operator"}
 
 
 def test_nobody_answers_or_lives_for_another(links: dict[str, Link]) -> None:

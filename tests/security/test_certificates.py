@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import os
 import stat
+import struct
 import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -24,7 +28,8 @@ from plgrim.security.certificates import (
     common_name,
     utc_now,
 )
-from tests.runtime.helpers import eventually
+from tests.faults.system import build_clock_shim
+from tests.runtime.helpers import REPOSITORY, eventually
 from tests.security.conftest import ROBOT
 from tests.security.helpers import joined, routing, secured
 
@@ -55,6 +60,61 @@ def test_files_and_their_modes(tmp_path: Path) -> None:
         check=False,
     )
     assert verified.returncode == 0, verified.stderr
+
+
+@pytest.mark.parametrize("issued", [utc_now(), dt.datetime(2040, 2, 29, tzinfo=dt.UTC)], ids=["now", "later"])
+def test_a_clock_that_starts_at_zero_refuses_no_certificate(issued: dt.datetime, tmp_path: Path) -> None:
+    """As of a robot without a battery after a power cut; the end is judged all the same."""
+    authority = Authority.create(tmp_path / "ca", now=issued)
+    authority.issue("gcp.robot.husky1", tmp_path / "out", now=issued)
+    chain, year_s = str(tmp_path / "out" / CERTIFICATE), 365 * 86400
+
+    def verifies(at_s: int, *trust: str) -> bool:
+        command = ["openssl", "verify", "-attime", str(at_s), *trust, "-untrusted", chain, chain]
+        return subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+    trusted = ("-partial_chain", "-CAfile", str(tmp_path / "out" / TRUSTED))
+    root = ("-CAfile", str(tmp_path / "ca" / "ca.pem"))
+    now_s = int(issued.timestamp())
+    for trust in (trusted, root):
+        assert [verifies(at_s, *trust) for at_s in (60, 20 * year_s, now_s, now_s + 364 * 86400)] == [
+            True
+        ] * 4
+        assert not verifies(now_s + year_s + 86400, *trust)
+
+
+_AT_ZERO = """
+import sys, threading, time
+from pathlib import Path
+from plgrim.runtime.zenoh_session import connect
+from tests.security.helpers import joined, routing, secured
+assert time.time() < 1e6, time.time()
+config = secured("husky1", Path(sys.argv[1]))
+with routing(config):
+    joined(config, "gcp", 10.0).close()
+print("joined")
+"""
+
+
+def test_processes_find_one_another_over_tls_when_the_clock_starts_at_zero(
+    certificates: Path, tmp_path: Path
+) -> None:
+    """Zenoh's own judgement: a router and a client in a process whose wall clock was never set."""
+    shim = build_clock_shim(tmp_path)
+    if shim is None:
+        pytest.skip("no C compiler for the clock's shim")
+    offset = tmp_path / "offset"
+    offset.write_bytes(struct.pack("q", -time.time_ns() + 60 * 10**9))
+    environment = {**os.environ, "LD_PRELOAD": str(shim), "CLOCK_OFFSET": str(offset)}
+    found = subprocess.run(
+        [sys.executable, "-c", _AT_ZERO, str(certificates)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+        cwd=REPOSITORY,
+    )
+    assert found.stdout.endswith("joined\n"), found.stdout + found.stderr
 
 
 def test_what_is_refused(tmp_path: Path) -> None:

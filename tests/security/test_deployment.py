@@ -8,13 +8,16 @@ from typing import Any
 
 import pytest
 import yaml
+from fastapi.testclient import TestClient
 
-from plgrim.config import Config, environment_overrides, load_config
+from plgrim.config import Config, check_service, environment_overrides, load_config
 from plgrim.deployment import Role, services_of, started_by_up
 from plgrim.errors import ConfigError
 from plgrim.security.access import RECORDER
 from schemas.hosts import is_loopback
 from schemas.topics import LINK, SERVICES
+from services.status.app import SharedStatus, create_app
+from services.status.config import Config as StatusConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 COMPOSE: dict[Role, Path] = {
@@ -109,6 +112,31 @@ def test_the_environment_of_each_container_is_a_valid_configuration(
             assert load_config().link.host == ("" if role == "all" else role)
 
 
+@pytest.mark.parametrize("path", ["/api/v1/status", "/metrics", "/map.png"])
+def test_the_page_of_the_compose_file_can_be_read_where_it_is_published(
+    path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the environment of its container, as a browser of the host asks: no token, and not by another name."""
+    for variable, value in composed("all")["status"]["environment"].items():
+        monkeypatch.setenv(variable, default(str(value)))
+    options = check_service(load_config(), "status")
+    assert isinstance(options, StatusConfig) and options.exposed() == ""
+    page = create_app(SharedStatus(options, "robot"))
+    for host, refused in (("127.0.0.1", False), ("localhost", False), ("evil.example", True)):
+        answer = TestClient(page, base_url=f"http://{host}:8080").get(path)
+        assert (answer.status_code == 403) is refused and answer.status_code != 401, (host, answer.text)
+
+
+def test_a_restarted_container_finds_its_journal_and_a_new_run_finds_none() -> None:
+    """`docker-compose.yml` is run again and again: its journals last as long as its containers."""
+    for name, service in composed("all").items():
+        kept = "state:/var/lib/plgrim" in service.get("volumes", ())
+        assert kept == (name in SERVICES), name
+        assert service["environment"]["PLGRIM_RUNTIME__STATE_DIR"] == "/var/lib/plgrim"
+    volumes = yaml.safe_load(COMPOSE["all"].read_text(encoding="utf-8"))["volumes"]
+    assert volumes["state"]["driver_opts"]["type"] == "tmpfs"
+
+
 @pytest.mark.parametrize("role", ["robot", "base"])
 def test_systemd_targets_want_the_services_of_their_role(role: Role) -> None:
     text = (ROOT / "deploy" / "systemd" / f"plgrim-{role}.target").read_text(encoding="utf-8")
@@ -118,6 +146,38 @@ def test_systemd_targets_want_the_services_of_their_role(role: Role) -> None:
     assert units == {f"plgrim@{name}.service" for name in services_of(role, simulated=False)}
     beside = {"plgrim-router.service", f"plgrim-{'link' if role == 'robot' else 'recorder'}.service"}
     assert set(wanted[1].split()) - units == beside
+
+
+def _unit_environment(unit: Path) -> dict[str, str]:
+    lines = re.findall(r"^Environment=(.*)$", unit.read_text(encoding="utf-8"), re.MULTILINE)
+    return dict(pair.split("=", 1) for line in lines for pair in line.split())
+
+
+def test_journals_outlive_a_boot_wherever_they_are_kept(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The monotonic clock begins anew at each boot: what was journaled before then seems to be of the future."""
+    found = [(unit.name, _unit_environment(unit)) for unit in (ROOT / "deploy" / "systemd").glob("*.service")]
+    for role in ("robot", "base"):
+        found += [(f"{role}.yml {n}", s["environment"]) for n, s in composed(role).items()]  # type: ignore[arg-type]
+    config_file = tmp_path / "plgrim.yaml"
+    config_file.write_text("{}\n", encoding="utf-8")
+    for name, environment in found:
+        with monkeypatch.context() as patch:
+            for variable in ("PLGRIM_RUNTIME__STATE_DIR", "PLGRIM_CLOCK__SOURCE"):
+                if variable in environment:
+                    patch.setenv(variable, environment[variable])
+            config = load_config(config_file)
+            assert config.runtime.state_dir and config.clock.source == "realtime", name
+
+
+def test_what_hangs_is_replaced_where_no_supervisor_watches() -> None:
+    for unit in ("plgrim@.service", "plgrim-link.service"):
+        text = (ROOT / "deploy" / "systemd" / unit).read_text(encoding="utf-8")
+        assert "Type=notify\n" in text and "WatchdogSec=8\n" in text and "StartLimitBurst=6\n" in text, unit
+    for file in COMPOSE.values():
+        for name, service in yaml.safe_load(file.read_text(encoding="utf-8"))["services"].items():
+            assert service["environment"]["PLGRIM_RUNTIME__WATCHDOG"] == "true", f"{file.name}: {name}"
 
 
 def test_systemd_units_are_confined() -> None:

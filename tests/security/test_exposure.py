@@ -9,9 +9,16 @@ import pytest
 from typer.testing import CliRunner
 
 from plgrim.cli import application
-from plgrim.config import load_config
+from plgrim.config import Config, load_config
 from plgrim.errors import ConfigError
-from plgrim.security.exposure import ExposedError, check_client, check_host, check_link, check_router
+from plgrim.security.exposure import (
+    ExposedError,
+    check_client,
+    check_host,
+    check_link,
+    check_listen,
+    check_router,
+)
 
 OPEN = ["tcp/0.0.0.0:7457", "tcp/[::]:7457", "tcp/192.0.2.1:7457", "tcp/base.local:7457", "ws/0.0.0.0:7457"]
 
@@ -99,6 +106,17 @@ def test_a_recorder_does_not_offer_its_segments_in_the_clear(tmp_path: Path) -> 
     arguments = ["record", "--out", str(tmp_path), "--base", "tcp/192.0.2.1:7447"]
     result = CliRunner().invoke(application, arguments)
     assert isinstance(result.exception, ExposedError), result.output
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "robot.local"])
+def test_foxglove_is_shown_to_this_host_alone(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its WebSocket has neither TLS nor tokens."""
+    result = CliRunner().invoke(application, ["foxglove", "--host", host, "--port", "0"])
+    assert isinstance(result.exception, ExposedError), result.output
+    assert host in str(result.exception)
+    for published_on in ("none", "127.0.0.1"):
+        check_listen(host, Config.model_validate({"deployment": {"published_on": published_on}}))
+    check_listen("127.0.0.1", Config())
 
 
 @pytest.mark.parametrize("command", [["router"], ["up"], ["run", "gcp"]])

@@ -205,15 +205,27 @@ def test_answers_tell_browsers_to_keep_to_what_was_said(tokens_file: Path) -> No
     assert answer.headers["x-frame-options"] == "DENY"
 
 
-def test_programs_of_this_host_may_ask_whatever_other_names_it_has(tokens_file: Path) -> None:
-    def ask(host: str, **config: object) -> int:
-        settings = Config.model_validate({"trusted_network": True, "host": "0.0.0.0", **config})
-        return TestClient(application(settings), base_url=f"http://{host}:8080").get("/show").status_code
+def test_a_network_without_strangers_reads_openly_under_the_names_of_loopback() -> None:
+    """In docker-compose.yml the page listens on every interface of a container and is published on loopback: it must
+    be readable there without a token, and no page whose name was made to point here may read it."""
 
-    assert ask("127.0.0.1", allowed_hosts=["robot.example"]) == 401  # a token is needed: it got through
-    assert ask("robot.example", allowed_hosts=["robot.example"]) == 401
+    def ask(host: str, path: str = "/show", **config: object) -> int:
+        settings = Config.model_validate({"trusted_network": True, "host": "0.0.0.0", **config})
+        return TestClient(application(settings), base_url=f"http://{host}:8080").get(path).status_code
+
+    for host in ("127.0.0.1", "localhost", "[::1]"):
+        assert ask(host) == 200
+        assert ask(host, read_token="always") == 401
+        assert ask(host, allowed_hosts=["robot.example"]) == 200
+    assert ask("robot.example", allowed_hosts=["robot.example"]) == 200
     assert ask("evil.example", allowed_hosts=["robot.example"]) == 403
-    assert ask("anything.example") == 401
+    assert ask("anything.example") == 403
+
+
+def test_elsewhere_any_name_will_do_and_a_token_is_needed() -> None:
+    settings = Config(host="0.0.0.0", tls_certificate_file="a.crt", tls_key_file="a.key")
+    asking = TestClient(application(settings), base_url="http://anything.example:8080")
+    assert asking.get("/show").status_code == 401
 
 
 def test_what_the_guard_refuses_is_a_problem_as_every_other_error(tokens_file: Path) -> None:
