@@ -159,7 +159,7 @@ def test_journals_outlive_a_boot_wherever_they_are_kept(
     """The monotonic clock begins anew at each boot: what was journaled before then seems to be of the future."""
     found = [(unit.name, _unit_environment(unit)) for unit in (ROOT / "deploy" / "systemd").glob("*.service")]
     for role in ("robot", "base"):
-        found += [(f"{role}.yml {n}", s["environment"]) for n, s in composed(role).items()]  # type: ignore[arg-type]
+        found += [(f"{role}.yml {n}", s["environment"]) for n, s in composed(role).items()]
     config_file = tmp_path / "plgrim.yaml"
     config_file.write_text("{}\n", encoding="utf-8")
     for name, environment in found:
