@@ -21,6 +21,8 @@ from services.gcp.roadnet import RoadNet
 
 _NEXT_OF_GROUP = 0.3
 """Frontiers of a group mostly look at the same unseen ground: the best one counts whole, the others so much."""
+_OF_A_GROUP = 8
+"""So many frontiers for each group are looked for near the robot."""
 _NEAR_COST = 0.5
 """Ways that cost less are equally near when gain is weighed by cost, nats: ten metres."""
 
@@ -63,11 +65,12 @@ class Outlook(NamedTuple):
 
 @njit
 def ways_from(
-    net: Net, source: int, wanted: NDArray[np.bool_], count: int, cost: Floats, distance_m: Floats
+    net: Net, source: int, wanted: NDArray[np.bool_], count: int, held: int, cost: Floats, distance_m: Floats
 ) -> None:
     """Cheapest ways (undiscounted cost) from a slot to the wanted frontiers, by slot, until `count` of them are found.
 
-    Ways do not pass through frontiers. cost: (n,) out, inf where no way was found. distance_m: (n,) out, along it.
+    held: one that is among them in any case; -1: none. Ways do not pass through frontiers. cost: (n,) out, inf where no
+    way was found. distance_m: (n,) out, along it.
     """
     n = net.node_id.shape[0]
     heap, place = np.empty(n, np.int32), np.full(n, -1, np.int32)
@@ -75,7 +78,7 @@ def ways_from(
     distance_m[source] = 0.0
     size = heap_push_or_lower(heap, place, cost, 0, source, 0.0)
     done = np.zeros(n, np.bool_)
-    while size > 0 and count > 0:
+    while size > 0 and (count > 0 or (held >= 0 and not done[held])):
         node = heap_pop(heap, place, cost, size)
         size -= 1
         done[node] = True
@@ -261,9 +264,10 @@ class Visits:
         frontiers = roads.frontier_slots()
         if frontiers.size == 0:
             return Outlook()
-        away, _ = self._ways(start, frontiers)
+        away, _ = self._ways(start, frontiers, _OF_A_GROUP * self._most, held)
         outlook = self._over(start, held, frontiers, away, 0)
         if outlook.net < self._near_worth:
+            away, _ = self._ways(start, frontiers)
             outlook = self._over(start, held, frontiers, away, self._most)
         return outlook
 
@@ -285,12 +289,16 @@ class Visits:
             tour = kept
         return Outlook(int(groups.slot[tour.order[0]]), tour.value, tour.net, kept.value)
 
-    def _ways(self, source: int, targets: Slots) -> tuple[Floats, Floats]:
+    def _ways(
+        self, source: int, targets: Slots, most: int | None = None, held: int = -1
+    ) -> tuple[Floats, Floats]:
+        """Cost and length of the ways to the `most` nearest targets (all) and the one held; inf and 0 of others."""
         net = self._roads.net
         wanted = np.zeros(net.node_id.size, np.bool_)
         wanted[targets] = True
         cost, distance_m = np.empty(net.node_id.size), np.zeros(net.node_id.size)
-        ways_from(net, source, wanted, int(targets.size), cost, distance_m)
+        count = int(targets.size) if most is None else min(most, int(targets.size))
+        ways_from(net, source, wanted, count, held if held >= 0 and wanted[held] else -1, cost, distance_m)
         return cost[targets], distance_m[targets]
 
     def _legs(self, start: int, stops: Slots) -> Legs:

@@ -88,7 +88,7 @@ def test_ways_do_not_lead_through_frontiers() -> None:
     n = roads.net.node_id.size
     wanted, cost, distance_m = np.zeros(n, np.bool_), np.empty(n), np.zeros(n)
     wanted[roads.frontier_slots()] = True
-    ways_from(roads.net, roads.slot_of(1), wanted, 2, cost, distance_m)
+    ways_from(roads.net, roads.slot_of(1), wanted, 2, -1, cost, distance_m)
     assert distance_m[roads.slot_of(2)] == 5.0
     assert cost[roads.slot_of(3)] == np.inf
 
@@ -156,3 +156,23 @@ def test_slivers_at_hand_do_not_hide_the_field_far_away(near_worth: float) -> No
         "the nearest, then the most for the way"
     )
     assert near.of[roads.slot_of(32)] == 4
+
+
+def test_the_frontier_held_is_found_beyond_the_nearest_ones() -> None:
+    nodes: dict[int, Node] = {
+        1: (CRUMB, 0.0, 0.0, 0.0),
+        2: (CRUMB, 20.0, 0.0, 0.0),
+        3: (CRUMB, 40.0, 0.0, 0.0),
+    }
+    edges = {(1, 2): (20.0, 0.0), (2, 3): (20.0, 0.0)}
+    for crumb in (1, 2, 3):
+        nodes[10 + crumb] = (FRONTIER, 20.0 * (crumb - 1), 3.0, 1.0)
+        edges[crumb, 10 + crumb] = (3.0, 0.0)
+    roads = road(nodes, edges)
+    n = roads.net.node_id.size
+    wanted = np.zeros(n, np.bool_)
+    wanted[roads.frontier_slots()] = True
+    for held, found in ((-1, [11]), (roads.slot_of(12), [11, 12]), (roads.slot_of(13), [11, 12, 13])):
+        cost, distance_m = np.empty(n), np.zeros(n)
+        ways_from(roads.net, roads.slot_of(1), wanted, 1, held, cost, distance_m)
+        assert [k for k in (11, 12, 13) if np.isfinite(cost[roads.slot_of(k)])] == found
