@@ -2,9 +2,8 @@
 
 After FIG-OP (Peltzer et al. 2022, arXiv 2203.06316): the QMDP weighs each frontier as if it were the only goal, and
 drives by a small opening on the way to a large one far away, to come back for it later. Here the order of the visits
-counts: V = sum over k of gamma^D_k S_k gain_k, with D the distance driven so far and S the probability that nothing
-fails on the way so far. Ways and risks count by what they delay and endanger: all is to be visited, and a discounted
-cost would be a reason to put off the long leg, for whatever crumb is nearer.
+counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the paper's cost
+of a leg.
 """
 
 from __future__ import annotations
@@ -37,29 +36,25 @@ class Groups(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """Legs of a tour: cost (the paper's), discount: gamma^distance (1 - rho), (k + 1, k): row k from the robot. inf
-    and 0 without a way.
-    """
+    """Legs of a tour: cost, discount (gamma^distance), (k + 1, k): row k from the robot. inf and 0 without a way."""
 
     cost: Floats
     discount: Floats
 
 
 class Tour(NamedTuple):
-    """An order of the groups and its value, and less what the legs cost: net; empty when none can be reached."""
+    """An order of the groups and its value; empty when none can be reached."""
 
     order: NDArray[np.int64]
     value: float
-    net: float = -np.inf
 
 
 class Outlook(NamedTuple):
-    """Where the best tour begins: slot of a frontier (-1: no tour), its value, net: less the way's cost too, and the
-    value of the best tour that begins with the frontier held (-inf: none)."""
+    """Where the best tour begins: slot of a frontier (-1: no tour), its value, and that of the best tour that begins
+    with the frontier held (-inf: none)."""
 
     first: int = -1
     value: float = -np.inf
-    net: float = -np.inf
     kept_value: float = -np.inf
 
 
@@ -98,25 +93,16 @@ def ways_from(
 
 
 @njit
-def tour_value(order: NDArray[np.int64], gain: Floats, discount: Floats) -> float:
+def tour_value(order: NDArray[np.int64], gain: Floats, cost: Floats, discount: Floats) -> float:
     """The value of visiting the groups in this order."""
     at, left, value = gain.shape[0], 1.0, 0.0
     for k in range(order.shape[0]):
-        left *= discount[at, order[k]]
-        at = order[k]
-        value += left * gain[at]
+        stop = order[k]
+        value -= left * cost[at, stop]
+        left *= discount[at, stop]
+        value += left * gain[stop]
+        at = stop
     return value
-
-
-@njit
-def tour_cost(order: NDArray[np.int64], cost: Floats, discount: Floats) -> float:
-    """What the legs cost, each discounted by those before it."""
-    at, left, total = cost.shape[1], 1.0, 0.0
-    for k in range(order.shape[0]):
-        total += left * cost[at, order[k]]
-        left *= discount[at, order[k]]
-        at = order[k]
-    return total
 
 
 @njit
@@ -134,10 +120,10 @@ def _move(order: NDArray[np.int64], i: int, j: int, turned: NDArray[np.int64]) -
 
 
 @njit
-def improve(order: NDArray[np.int64], fixed: int, gain: Floats, discount: Floats) -> float:
+def improve(order: NDArray[np.int64], fixed: int, gain: Floats, cost: Floats, discount: Floats) -> float:
     """Move single stops and turn stretches round, as long as it helps, in place. The first `fixed` stops stay."""
     n = order.shape[0]
-    best = tour_value(order, gain, discount)
+    best = tour_value(order, gain, cost, discount)
     trial = order.copy()
     better = True
     while better:
@@ -154,7 +140,7 @@ def improve(order: NDArray[np.int64], fixed: int, gain: Floats, discount: Floats
                         trial[i : j + 1] = order[i : j + 1][::-1]
                     else:
                         continue
-                    value = tour_value(trial, gain, discount)
+                    value = tour_value(trial, gain, cost, discount)
                     if value > best + 1e-9:
                         order[:] = trial
                         best, better = value, True
@@ -175,7 +161,7 @@ def _greedy(
         best, value = -1, -np.inf
         for k in range(n):
             if not used[k] and cost[at, k] < np.inf:
-                q = discount[at, k] * gain[k]
+                q = discount[at, k] * gain[k] - cost[at, k]
                 if q > value:
                     best, value = k, q
         if best < 0:
@@ -194,8 +180,8 @@ def best_tour(gain: Floats, legs: Legs, first: int = -1) -> Tour:
     if not reached.any() or (first >= 0 and not reached[first]):
         return Tour(np.zeros(0, np.int64), -np.inf)
     order = _greedy(first, reached, gain, cost, discount)
-    value = improve(order, 1 if first >= 0 else 0, gain, discount)
-    return Tour(order, value, value - tour_cost(order, cost, discount))
+    value = improve(order, 1 if first >= 0 else 0, gain, cost, discount)
+    return Tour(order, float(value))
 
 
 def group_frontiers(
@@ -266,7 +252,7 @@ class Visits:
             return Outlook()
         away, _ = self._ways(start, frontiers, _OF_A_GROUP * self._most, held)
         outlook = self._over(start, held, frontiers, away, 0)
-        if outlook.net < self._near_worth:
+        if outlook.value < self._near_worth:
             away, _ = self._ways(start, frontiers)
             outlook = self._over(start, held, frontiers, away, self._most)
         return outlook
@@ -287,7 +273,7 @@ class Visits:
         )
         if kept.value > tour.value:  # the search of the free tour ended in a worse place
             tour = kept
-        return Outlook(int(groups.slot[tour.order[0]]), tour.value, tour.net, kept.value)
+        return Outlook(int(groups.slot[tour.order[0]]), tour.value, kept.value)
 
     def _ways(
         self, source: int, targets: Slots, most: int | None = None, held: int = -1
@@ -302,13 +288,8 @@ class Visits:
         return cost[targets], distance_m[targets]
 
     def _legs(self, start: int, stops: Slots) -> Legs:
-        shape, w = (stops.size + 1, stops.size), self._roads.weights
-        cost, discount = np.full(shape, np.inf), np.zeros(shape)
+        cost, discount = np.full((stops.size + 1, stops.size), np.inf), np.zeros((stops.size + 1, stops.size))
         for row, source in enumerate([*stops.tolist(), start]):
             cost[row], distance_m = self._ways(source, stops)
-            reached = np.isfinite(cost[row])
-            of_risk = np.maximum(cost[row] - w.k_cost * w.k_distance_per_m * distance_m, 0.0)
-            # A way's cost has the sum of its edges' rho: all of them hold with about exp(-sum).
-            failing = of_risk / max(w.k_cost * w.k_risk, 1e-9) if w.k_risk > 0.0 else np.zeros(stops.size)
-            discount[row, reached] = self._gamma ** distance_m[reached] * np.exp(-failing[reached])
+            discount[row] = self._gamma**distance_m
         return Legs(cost, discount)

@@ -117,10 +117,10 @@ class Config(BaseModel):
         3, ge=1, le=100, description="Seen in fewer rounds and gone again, such a border never was one."
     )
     opening_depth_m: float = Field(
-        8.0, ge=0, le=100, description="Behind each metre of such a border so much ground is expected, m, but"
+        4.0, ge=0, le=100, description="Behind each metre of such a border so much ground is expected, m, but"
     )
     unknown_max_gain: float = Field(
-        24.0, ge=0, le=1000, description="this is the most that the unknown adds to a frontier, nats."
+        12.0, ge=0, le=1000, description="this is the most that the unknown adds to a frontier, nats."
     )
     give_up_s: float = Field(6.0, gt=0, le=600, description="Time beside a frontier that yields nothing, s.")
     pursue_s: float = Field(
