@@ -102,6 +102,7 @@ def run_live(
         attach_recorder(link, recorder)
         if supervisor.wait_ready(stop, progress.waiting):
             _follow(recorder, stop, progress.update, supervisor.poll, until_end)
+        supervisor.finished = recorder.finished or recorder.lost
         recorder.restarts = {c.name: c.restarted for c in supervisor.children.values() if c.restarted}
     return recorder.write(out_dir, extra={"wall_s": round(time.monotonic() - began, 1)})
 

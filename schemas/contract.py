@@ -176,7 +176,8 @@ class Resuming(Protocol):
         """Called once after `restore` and `replay`, but not when lock-step restores all stages at once.
 
         Others may have heard what was said since the last record: numbers that must not be given twice are skipped,
-        and what does not survive a pause is dropped.
+        and what does not survive a pause is dropped. Called again for each life that began with the same state and
+        ended before it left a snapshot: numbers are skipped once for each.
         """
         ...
 

@@ -76,13 +76,19 @@ def up(
     role: Annotated[
         str | None, typer.Option(help="What this host is: robot, base or all (default: link.host).")
     ] = None,
+    new: Annotated[
+        bool, typer.Option("--new", help="Begin anew where a mission has not ended: its state is lost.")
+    ] = False,
     speed: Speed = None,
     out: OutFolder = Path("out/up"),
     config_file: ConfigFile = None,
 ) -> None:
     """Start this host's router and services, and watch over them until the mission's end or Ctrl-C."""
     from plgrim.deployment import role_named, role_of, started_by_up
+    from plgrim.runtime.run_folder import refuse_unfinished
 
+    if not new:
+        refuse_unfinished(out)
     overrides: dict[str, Any] = {}
     put(overrides, "clock.speed", speed)
     if role is not None:
@@ -97,7 +103,7 @@ def recover(
     folder: Annotated[Path, typer.Argument(help="Result folder of a run that was cut off.")],
     keep: Annotated[bool, typer.Option("--keep", help="Go on after the mission's end.")] = False,
 ) -> None:
-    """Go on with a mission of which everything died (a power cut), from the journals in its folder."""
+    """Go on with a mission that was cut off (a power cut, Ctrl-C, a shutdown), from the journals in its folder."""
     from plgrim.deployment import started_by_up
     from plgrim.runtime.run_folder import with_kept_state
 

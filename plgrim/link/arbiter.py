@@ -50,6 +50,7 @@ class Arbiter:
     lease: Lease
     dropped: Counter[str] = field(default_factory=Counter)
     _marks: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
+    _taken_ns: dict[str, int] = field(default_factory=dict)
     _last: dict[tuple[str, str], _Word] = field(default_factory=dict)
     _sequence: Counter[str] = field(default_factory=Counter)
     _unanswered_ns: int | None = None
@@ -109,11 +110,18 @@ class Arbiter:
         message, envelope = decode(payload, topic.message, topic.max_bytes)
         if envelope.robot != self.robot or envelope.writer != self.service:
             raise WrongSenderError(f"from {envelope.writer!r} of {envelope.robot!r}")
+        self._forget_the_silent(instance, now_ns)
         mark, last = (envelope.epoch, envelope.sequence), self._marks.get((instance, topic.name))
         if last is not None and mark <= last:
             raise WrongSenderError(f"{mark} is not newer than {last}")
         self._marks[instance, topic.name] = mark
+        self._taken_ns[instance] = now_ns
         return _Word(topic, message, envelope, now_ns)
+
+    def _forget_the_silent(self, instance: str, now_ns: int) -> None:
+        """An instance of which nothing was taken for so long has no lease: its next life may have an earlier clock."""
+        if now_ns - self._taken_ns.get(instance, now_ns) > self._silent_ns:
+            self._marks = {key: mark for key, mark in self._marks.items() if key[0] != instance}
 
     def _judge_health(self, instance: str, word: _Word, now_ns: int) -> None:
         assert isinstance(word.message, StageHealth)
@@ -168,7 +176,12 @@ class Arbiter:
 
 
 def note_robot(seen: Seen, topic: Topic[Message], message: Message, envelope: Envelope, now_ns: int) -> None:
-    """Note what the robot has said; of the Global IRM also its version."""
+    """Note what the robot has said; of the Global IRM also its version, which a new life of irm may begin anew."""
+    last = seen.newest(topic.name)
     seen.note(topic.name, (envelope.epoch, envelope.sequence), now_ns)
     if isinstance(message, GlobalIrm):
-        seen.note(_GRAPH_VERSION, (0, message.irm_version), now_ns)
+        version, known = (0, message.irm_version), seen.newest(_GRAPH_VERSION)
+        new_life = last is None or last[0] != envelope.epoch
+        if new_life and known is not None and version < known:
+            seen.forget(_GRAPH_VERSION)
+        seen.note(_GRAPH_VERSION, version, now_ns)

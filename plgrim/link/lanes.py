@@ -16,10 +16,15 @@ from schemas.contract import Topic
 
 @dataclass(frozen=True, slots=True)
 class Parcel:
-    """One message to be sent."""
+    """One message to be sent. whole: it stands for all that was said before it on its topic (a whole graph)."""
 
     topic: Topic[Message]
     payload: bytes
+    whole: bool = False
+
+
+def _bytes_beside_wholes(queue: deque[Parcel]) -> int:
+    return sum(len(waiting.payload) for waiting in queue if not waiting.whole)
 
 
 @dataclass(slots=True)
@@ -27,8 +32,9 @@ class Lane:
     """Not thread safe: the sender locks around it.
 
     every: topics of which every message is sent, in order, before all others. limit_bytes: what one of them may keep
-    waiting. Of differences (`differences`) all are dropped when one has to be: the reader asks for the whole anew.
-    Of other topics the oldest go. replaced, dropped: counted by topic.
+    waiting, but for a whole. Of differences (`differences`) all are dropped when one has to be: the reader asks for the
+    whole anew. A whole takes the place of all before it and is never dropped, however large it is: the reader that
+    asked for it would ask for ever. Of other topics the oldest go. replaced, dropped: counted by topic.
     """
 
     budget: Bucket
@@ -40,6 +46,7 @@ class Lane:
     dropped: Counter[str] = field(default_factory=Counter)
     _queues: dict[str, deque[Parcel]] = field(default_factory=dict)
     _newest: OrderedDict[str, Parcel] = field(default_factory=OrderedDict)
+    _held_until: dict[str, int] = field(default_factory=dict)
 
     def offer(self, parcel: Parcel) -> None:
         """Take in a message to send."""
@@ -50,12 +57,25 @@ class Lane:
             self._newest[name] = parcel
             return
         queue = self._queues.setdefault(name, deque())
+        if parcel.whole:
+            self.replaced[name] += len(queue)
+            queue.clear()
         queue.append(parcel)
-        while sum(len(waiting.payload) for waiting in queue) > self.limit_bytes and len(queue) > 1:
-            gone = len(queue) if name in self.differences else 1
-            self.dropped[name] += gone
-            for _ in range(gone):
-                queue.popleft()
+        while len(queue) > 1 and _bytes_beside_wholes(queue) > self.limit_bytes:
+            kept = (
+                [waiting for waiting in queue if waiting.whole]
+                if name in self.differences
+                else list(queue)[1:]
+            )
+            self.dropped[name] += len(queue) - len(kept)
+            queue.clear()
+            queue.extend(kept)
+
+    def put_back(self, parcel: Parcel, until_ns: int) -> None:
+        """A message of a topic in `every` could not be sent yet: it stays the next of its topic, from then on."""
+        name = parcel.topic.name
+        self._queues.setdefault(name, deque()).appendleft(parcel)
+        self._held_until[name] = until_ns
 
     def take(self, now_ns: int) -> tuple[Parcel | None, int]:
         """The next message to send now, or None and the time to wait (ns; -1: until something is offered)."""
@@ -68,8 +88,10 @@ class Lane:
         waits = []
         for name in names:
             bucket = self.topic_budgets.get(name)
-            wait_ns = bucket.wait_ns(now_ns) if bucket else 0
-            if wait_ns == 0:
+            wait_ns = max(
+                self._held_until.get(name, now_ns) - now_ns, bucket.wait_ns(now_ns) if bucket else 0
+            )
+            if wait_ns <= 0:
                 return self._pop(name), 0
             waits.append(wait_ns)
         return None, min(waits)

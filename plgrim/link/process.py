@@ -18,6 +18,7 @@ from plgrim.link.arbiter import Arbiter, ToPublish, note_robot
 from plgrim.link.budget import Meter
 from plgrim.link.in_step import Seen
 from plgrim.link.lease import STANDBY
+from plgrim.link.relay import Relay
 from plgrim.link.routes import LANES, down, lane_of, up_plain
 from plgrim.link.uplink import Meters, Uplink, Wanted
 from plgrim.logs import get_logger
@@ -63,7 +64,8 @@ class LinkProcess:
             name: Arbiter.of(name, config.robot, config.link, self._seen, service.epoch)
             for name in config.link.leased
         }
-        self._mailbox = Mailbox(config.robot, tuple(up_plain(config.link)))
+        silent_ns = config.link.ns("silent_after_s")
+        self._relay = Relay(config.robot, tuple(up_plain(config.link)), service.epoch, silent_ns)
         self._sent_down = Mailbox(config.robot, tuple(down(config.link)))
         self._outbox = Outbox(config.robot, LINK, service.epoch)
         self._meters = Meters(Meter(), Meter())
@@ -133,9 +135,10 @@ class LinkProcess:
             accepted = self._sent_down.accept(topic, payload, now_ns, read)
             self._sent_down.stepped()
             if accepted:
-                note_robot(self._seen, topic, *read(payload, topic.message, topic.max_bytes), now_ns)
+                message, envelope = read(payload, topic.message, topic.max_bytes)
+                note_robot(self._seen, topic, message, envelope, now_ns)
         if accepted:
-            self._uplinks[lane_of(topic)].offer(topic, payload)
+            self._uplinks[lane_of(topic)].offer(topic, payload, message)
 
     def _from_standby(self, topic: Topic[Message], payload: bytes) -> None:
         self._arbitrate(STANDBY, topic, payload)
@@ -144,11 +147,10 @@ class LinkProcess:
         if instance:
             self._arbitrate(instance, topic, payload)
             return
-        with self._lock:
-            accepted = self._mailbox.accept(topic, payload, time.monotonic_ns())
-            self._mailbox.stepped()
-        if accepted:
-            self._publish([(topic, payload)])
+        with self._lock:  # as in `_arbitrate`: in the order of their sequence numbers
+            sealed = self._relay.receive(topic, payload, time.monotonic_ns())
+            if sealed is not None:
+                self._publish([(topic, sealed)])
 
     def _arbitrate(self, instance: str, topic: Topic[Message], payload: bytes) -> None:
         arbiter = self._arbiters[topic.writer]
@@ -188,7 +190,7 @@ class LinkProcess:
         with self._lock:
             for arbiter in self._arbiters.values():
                 found.update(arbiter.dropped)
-            found.update(self._mailbox.dropped)
+            found.update(self._relay.dropped)
             found.update(self._sent_down.dropped)
         for uplink in self._uplinks.values():
             found.update(uplink.counts()[1])

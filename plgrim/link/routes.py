@@ -5,7 +5,16 @@ from __future__ import annotations
 from plgrim.link.config import LinkConfig
 from schemas.base import Message
 from schemas.contract import Topic
-from schemas.topics import LINK, SERVICES, TOPICS, health_topic, read_by, written_by
+from schemas.topics import (
+    ANSWER,
+    GLOBAL_IRM,
+    LINK,
+    SERVICES,
+    TOPICS,
+    health_topic,
+    read_by,
+    written_by,
+)
 from schemas.world import GraphRequest
 
 COMMANDS, MAPS = "commands", "maps"
@@ -37,8 +46,10 @@ def down(config: LinkConfig) -> list[Topic[Message]]:
 
 
 def needs_every(topic: Topic[Message], config: LinkConfig) -> bool:
-    """Whether every message must go over the link: a reader at the base that counts on it; status only shows."""
-    if topic.name == "irm/global_irm":
+    """Whether every message must go over the link: a reader at the base counts on it. status shows, but it waits for
+    the answer to each command.
+    """
+    if topic in (GLOBAL_IRM, ANSWER):
         return True
     return topic.keep_all and bool(set(topic.readers) & set(config.leased))
 

@@ -22,11 +22,14 @@ from plgrim.logs import Seldom, get_logger
 from plgrim.runtime.zenoh_session import Link, is_latched, open_session
 from schemas.base import Message
 from schemas.compact import compact
-from schemas.contract import Topic
-from schemas.topics import LINK
+from schemas.contract import SECOND_NS, Topic
+from schemas.topics import GLOBAL_IRM, LINK
+from schemas.world import GlobalIrm
 
 _LOOK_S = 0.1
 _TRY_S = 10.0
+_UNHEARD_NS = 5 * SECOND_NS
+"""So long what must not be lost waits for a reader: after a cut the base's router tells of its readers again."""
 Arrived = Callable[[str, Topic[Message], bytes], None]
 Wanted = list[tuple[str, Topic[Message]]]
 
@@ -57,7 +60,7 @@ def make_lane(config: Config, name: str) -> Lane:
         Bucket(1000 * rate),
         {t.name: Bucket(1000 * link.topic_kb_per_s[t.name]) for t in topics if t.name in link.topic_kb_per_s},
         frozenset(t.name for t in topics if needs_every(t, link)),
-        frozenset({"irm/global_irm"}),
+        frozenset({GLOBAL_IRM.name}),
         int(1000 * link.queue_kb),
     )
 
@@ -76,6 +79,7 @@ class Uplink:
         self._changed = threading.Condition()
         self._stop = threading.Event()
         self._unsent = Seldom()
+        self._unheard_ns: dict[str, int] = {}
         self._publishers: dict[str, zenoh.Publisher | ext.AdvancedPublisher] = {}
         self._thread = threading.Thread(target=self._run, name=f"uplink {name}", daemon=True)
 
@@ -90,10 +94,11 @@ class Uplink:
             self._changed.notify()
         self._thread.join(timeout_s)
 
-    def offer(self, topic: Topic[Message], payload: bytes) -> None:
-        """Hand over a message for the base; never waits."""
+    def offer(self, topic: Topic[Message], payload: bytes, message: Message) -> None:
+        """Hand over a message for the base; never waits. message: what the payload says."""
+        whole = isinstance(message, GlobalIrm) and message.base_version == 0
         with self._changed:
-            self._lane.offer(Parcel(topic, payload))
+            self._lane.offer(Parcel(topic, payload, whole))
             self._changed.notify()
 
     def counts(self) -> tuple[float, dict[str, int]]:
@@ -116,6 +121,7 @@ class Uplink:
                 if parcel is not None:
                     self._send(session, parcel)
                 elif not self.connected:
+                    self._unheard_ns.clear()
                     self._stop.wait(_LOOK_S)
             self.connected = False
 
@@ -150,7 +156,9 @@ class Uplink:
         try:
             publisher = self._publishers.get(topic.name) or self._declare(session, topic)
             if isinstance(publisher, zenoh.Publisher) and not _is_heard(publisher):
+                self._nobody_listens(parcel)
                 return
+            self._unheard_ns.pop(topic.name, None)
             small = compact(parcel.payload)
             publisher.put(small)
         except Exception as error:  # whatever is wrong with one message: the lane goes on with the next
@@ -160,6 +168,17 @@ class Uplink:
         with self._changed:
             self._lane.spent(topic.name, len(small), now_ns)
         self._meters.down.count(topic.name, len(small), now_ns)
+
+    def _nobody_listens(self, parcel: Parcel) -> None:
+        """What must not be lost waits for a reader a while, then it is counted; other things nobody misses."""
+        name, now_ns = parcel.topic.name, time.monotonic_ns()
+        with self._changed:
+            if name not in self._lane.every or name in self._lane.differences:
+                return
+            if now_ns - self._unheard_ns.setdefault(name, now_ns) < _UNHEARD_NS:
+                self._lane.put_back(parcel, now_ns + int(_LOOK_S * SECOND_NS))
+            else:
+                self._lane.dropped[name] += 1
 
     def _note_unsent(self, topic: Topic[Message], error: Exception) -> None:
         with self._changed:

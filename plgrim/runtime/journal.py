@@ -72,8 +72,9 @@ def _checksum(content: bytes, *numbers: int) -> bytes:
 class Journal:
     """The journal of one service in `folder`, which is made if need be. One process at a time writes it.
 
-    `recover` first, which reads; then `begin` with a snapshot; then `append` and `begin` as often as one likes. Each
-    returns when its content is on the disk. damage: what `recover` found wrong, for the log. Raises JournalError.
+    `recover` first, which reads; then `begin` with a snapshot, or `go_on` with a state that was found; then `append`
+    and `begin` as often as one likes. Each returns when its content is on the disk. damage: what `recover` found
+    wrong, for the log. Raises JournalError.
     """
 
     def __init__(self, folder: Path, service: str, durable: bool = True) -> None:
@@ -83,6 +84,9 @@ class Journal:
         self._synchronous = "FULL" if durable else "NORMAL"
         self._connections: list[sqlite3.Connection | None] = [None, None]
         self._slot = 1
+        self._tail = 1
+        """The file in which records are written; -1: what was found is too damaged to append to."""
+        self._slots_found: dict[int, int] = {}
         self._generation = 0
         self._next = 1
         self._writing = False
@@ -109,9 +113,11 @@ class Journal:
         if states:  # the generation that one goes on from must outlive the writing of the next
             newest = states[0]
             self._generation, self._next = newest.generation, newest.first + len(newest.records)
-            self._slot = next(
-                i for i, s in enumerate(slots) if s is not None and s.number == newest.generation
-            )
+            self._slots_found = {s.number: i for i, s in enumerate(slots) if s is not None}
+            self._slot = self._slots_found[newest.generation]
+            # The last of its records may stand in a newer file, of which only the snapshot is damaged.
+            leads_on = found[0].first + len(found[0].records) == self._next
+            self._tail = self._slots_found[found[0].number] if leads_on else -1
         elif any(
             path.exists() for path in self._paths
         ):  # of no use, and not to be taken for newer ones later
@@ -198,6 +204,23 @@ class Journal:
             raise
         return connection
 
+    def go_on(self, state: Recovered) -> bool:
+        """Append to a state that was found, without a new snapshot: both generations stay. Raises JournalError.
+
+        False when its records do not lead to the newest one: a snapshot has to come first, and the next `begin` keeps
+        this state's file. What stands behind the last record was of no use and goes.
+        """
+        if state.first + len(state.records) != self._next or self._tail < 0:
+            self._slot = self._slots_found[state.generation]
+            return False
+        with _clear_errors(self._paths[self._tail]):
+            connection = self._writable(self._tail)
+            with _transaction(connection):
+                connection.execute("DELETE FROM record WHERE number >= ?", (self._next,))
+                connection.execute(f"PRAGMA user_version = {_FORMAT}")  # written: a full disk is noticed now
+        self._writing = True
+        return True
+
     def begin(self, snapshot: bytes, now_ns: int) -> None:
         """Begin the next generation with a snapshot. now_ns: mission clock, ns. Raises JournalError."""
         target = 1 - self._slot
@@ -209,7 +232,8 @@ class Journal:
             except sqlite3.Error:  # damaged, or no space: it holds nothing that is still needed
                 self._discard(target)
                 self._replace(target, row)
-        self._slot, self._generation, self._writing = target, number, True
+        self._slot = self._tail = target
+        self._generation, self._writing = number, True
 
     def _replace(self, index: int, row: tuple[int, int, int, bytes, bytes]) -> None:
         connection = self._writable(index)
@@ -240,8 +264,8 @@ class Journal:
         """Add one record. It is on the disk when this returns. Raises JournalError; then begin anew."""
         if not self._writing:
             raise JournalError("a journal begins with a snapshot")
-        with _clear_errors(self._paths[self._slot]):
-            connection = self._writable(self._slot)
+        with _clear_errors(self._paths[self._tail]):
+            connection = self._writable(self._tail)
             with _transaction(connection):
                 connection.execute(
                     "INSERT INTO record VALUES (?, ?, ?)",

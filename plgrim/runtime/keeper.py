@@ -2,6 +2,10 @@
 
 The order is what makes it safe: a step, its record on the disk, and only then its outputs on the wire. Snapshots are
 taken between steps, never inside one.
+
+A stage that acknowledges (`Journaling`) is never begun anew over what it has acknowledged: neither after a crash loop
+nor when nothing can be restored. Until a resumed life has got through its first steps it takes no snapshot, so that
+both generations outlive it; its records go behind those of the life before.
 """
 
 from __future__ import annotations
@@ -25,7 +29,7 @@ _LARGEST_SHARE = 0.02
 _NOT_DURABLE = frozenset({"sim"})
 """The simulated world dies with its host: its journal need not wait for the disk, 4 times a second."""
 _TRIES = 3
-"""A state from which so many lives in a row did not get through their first steps is not restored once more."""
+"""A state from which so many lives in a row did not get through their first steps gives way to the one before it."""
 _GOOD_STEPS = 3
 _EPOCHS_OF_A_LIFE = 10_000
 """The link process begins a new epoch with every lease that it grants: its next life comes after all of these."""
@@ -85,33 +89,72 @@ class Keeper:
         make: gives a new stage; called again when a state cannot be restored. now: mission clock. Raises JournalError
         and what `make` raises.
         """
-        stage = make()
-        states = self._journal.recover()
+        states = self._usable(now)
         for damage in self._journal.damage:
             self._log.error("journal damaged", what=damage)
         tries = _read_number(self._tries)
-        for state in states:
-            if tries >= _TRIES:
-                self._log.error("the state is not used: no life that began with it went on", tries=tries)
-                self._forget_tries()  # what this life comes to is a state to go on from again
-                break
-            if state.saved_ns > now:
-                self._log.warning("journal of another mission: not used", saved_s=state.saved_ns / SECOND_NS)
-                continue
+        stage = make()
+        used = None
+        for state in self._still_good(states, tries, isinstance(stage, Journaling)):
             if self._restore(stage, state):
-                self.recovered = True
+                used = state
                 break
             stage = make()
-        if self.recovered:
-            self._steps_to_go = _GOOD_STEPS
-            _write_number(self._tries, tries + 1)
-            _tell(stage)
-        self._begin(stage, now)
-        if (
-            self.trouble and not self.recovered
-        ):  # the user's to mend; a robot on its way goes on without a journal
-            raise JournalError(self.trouble)
+        if used is None:
+            self._start_new(stage, now, bool(states))
+        else:
+            self._resume(stage, used, tries + 1, now)
         return stage
+
+    def _usable(self, now: Stamp) -> list[Recovered]:
+        """The states of this mission, the newest first."""
+        states = self._journal.recover()
+        for state in states:
+            if state.saved_ns > now:
+                self._log.warning("journal of another mission: not used", saved_s=state.saved_ns / SECOND_NS)
+        return [state for state in states if state.saved_ns <= now]
+
+    def _still_good(self, states: list[Recovered], tries: int, acknowledges: bool) -> list[Recovered]:
+        """Those with which so many lives have not been tried in vain."""
+        if tries < _TRIES:
+            return states
+        self._log.error("the newest state is not used: no life that began with it went on", tries=tries)
+        if not acknowledges or tries >= 2 * _TRIES:
+            return []
+        return states[1:] or states
+
+    def _start_new(self, stage: Restorable, now: Stamp, was_more: bool) -> None:
+        """was_more: there are states of this mission, none of which is any good."""
+        if was_more and isinstance(stage, Journaling):
+            raise JournalError(
+                f"{self._journal.folder}: no state of {self._journal.service} leads on, see its log, and it does not "
+                f"begin anew over what it has acknowledged (a stop, fences, the map); to try once more remove "
+                f"{self._tries.name}, to begin anew move {self._journal.service}.*.sqlite elsewhere as well"
+            )
+        self._forget_tries()  # what this life comes to is a state to go on from again
+        self._begin(stage, now)
+        if self.trouble:  # the user's to mend; a robot on its way goes on without a journal
+            raise JournalError(self.trouble)
+
+    def _resume(self, stage: Restorable, state: Recovered, tries: int, now: Stamp) -> None:
+        """tries: the lives that have begun with what is on the disk, this one included."""
+        self.recovered = True
+        self._steps_to_go = _GOOD_STEPS
+        _write_number(self._tries, tries)
+        if not isinstance(stage, Journaling):
+            _tell(stage, 1)
+            self._begin(stage, now)
+            return
+        _tell(stage, tries)  # the lives before it left no snapshot of the numbers that they gave
+        leads_on = False
+
+        def go_on() -> None:
+            nonlocal leads_on
+            leads_on = self._journal.go_on(state)
+
+        self._write(go_on)
+        if not leads_on and not self.trouble:
+            self._begin(stage, now)
 
     def _restore(self, stage: Restorable, state: Recovered) -> bool:
         began = self._stopwatch()
@@ -144,9 +187,13 @@ class Keeper:
         """Take a snapshot when it is time. Call it between steps that went well."""
         if self._steps_to_go:
             self._steps_to_go -= 1
-            if not self._steps_to_go:
-                self._forget_tries()
-        if self._stopwatch() >= self._due_s:
+            if self._steps_to_go:
+                return
+            self._begin(
+                stage, now
+            )  # before the tries are forgotten: it holds the numbers that they have skipped
+            self._forget_tries()
+        elif self._stopwatch() >= self._due_s:
             self._begin(stage, now)
 
     def _forget_tries(self) -> None:
@@ -174,6 +221,7 @@ class Keeper:
         """Close the journal, with a last snapshot of a stage that ends in order."""
         if stage is not None:
             self._begin(stage, now)
+            self._forget_tries()  # it did not die
         self._journal.close()
         if self._lock is not None:
             self._lock.close()
@@ -190,9 +238,11 @@ def _lock(folder: Path, service: str) -> Lock | None:
         return None
 
 
-def _tell(stage: object) -> None:
+def _tell(stage: object, lives: int) -> None:
+    """Once for each life that began with this state: numbers that any of them gave are not given again."""
     if isinstance(stage, Resuming):
-        stage.resumed()
+        for _ in range(lives):
+            stage.resumed()
 
 
 def next_epoch(config: RuntimeConfig, robot: str, service: str, now_ms: int) -> int:

@@ -44,8 +44,38 @@ def with_fresh_state(config: Config, run_folder: Path) -> Config:
     return _changed(config, "runtime", state_dir=str(state.resolve()))
 
 
+def refuse_unfinished(folder: Path) -> None:
+    """A mission that has not ended is not written over. Raises ConfigError when its journals are in this run folder,
+    AlreadyRunningError when a supervisor is at work in it. A folder that is not there is not made.
+    """
+    if not folder.exists():
+        return
+    lock = lock_run_folder(folder)
+    try:
+        if state := _journals(folder):
+            raise ConfigError(
+                f"{folder}: holds a mission that has not ended (journals in {state}): go on with it by `plgrim recover "
+                f"{folder}`, begin another one by --new, or name another folder with --out"
+            )
+    finally:
+        lock.close()
+
+
+def _journals(folder: Path) -> Path | None:
+    """The folder of the journals that the last run in a run folder has left; None when there are none."""
+    file = folder / "config.yaml"
+    if not file.exists():
+        return None
+    try:
+        named = load_config(file).runtime.state_dir
+    except ConfigError:  # of another version: where its journals are is not known, but for the usual place
+        named = str(folder / "state")
+    state = Path(named) if named else None
+    return state if state is not None and any(state.glob("*/*.sqlite")) else None
+
+
 def with_kept_state(folder: Path) -> Config:
-    """The configuration of the run that ended in this folder without an end, its mission clock going on.
+    """The configuration of the run in this folder whose mission has not ended, its mission clock going on.
 
     In the same boot the clock has run on; after a reboot it goes on where it stopped. Raises ConfigError when there is
     nothing to go on from.
@@ -56,8 +86,8 @@ def with_kept_state(folder: Path) -> Config:
     config = load_config(file)
     if not config.runtime.state_dir or not Path(config.runtime.state_dir).is_dir():
         raise ConfigError(
-            f"{file}: runtime.state_dir: {config.runtime.state_dir or 'empty'}: no journals there; a run that ended in "
-            "order keeps none: start a new one"
+            f"{file}: runtime.state_dir: {config.runtime.state_dir or 'empty'}: no journals there; a mission "
+            "that has ended keeps none: start a new one"
         )
     saved = _read_clock(Path(config.runtime.state_dir) / _CLOCK)
     if config.clock.source != "monotonic" or saved.get("boot") == boot_id():

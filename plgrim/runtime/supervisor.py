@@ -58,9 +58,9 @@ __all__ = ["ROUTER", "Child", "Command", "Supervisor", "plgrim_command", "with_f
 class Supervisor:
     """Runs the router and services; a context manager that ends them all, whatever happens.
 
-    run_folder: gets `config.yaml` (what the children read), `logs/`, and `state/` (their journals, kept only when the
-    run fails). resume: go on with the state that the configuration names. Call `poll` often. Raises AlreadyRunningError
-    when another supervisor is at work in the folder.
+    run_folder: gets `config.yaml` (what the children read), `logs/`, and `state/` (their journals, kept until the
+    mission has ended: `finished`). resume: go on with the state that the configuration names. Call `poll` often. Raises
+    AlreadyRunningError when another supervisor is at work in the folder.
     """
 
     def __init__(
@@ -78,6 +78,8 @@ class Supervisor:
         self._log = get_logger()
         self._lock = threading.Lock()
         self._all_were_ready = False
+        self.finished = False
+        """Whether the mission has come to its end, and nobody will go on with its state. Set by who follows it."""
         self.link: Link | None = None
         logs = run_folder / "logs"
         logs.mkdir(parents=True, exist_ok=True)
@@ -99,7 +101,7 @@ class Supervisor:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.shutdown()
-        if kind is None:
+        if kind is None and self.finished:
             shutil.rmtree(self.config.runtime.state_dir, ignore_errors=True)
         self._lock_file.close()
 

@@ -2,9 +2,8 @@
 
 After FIG-OP (Peltzer et al. 2022, arXiv 2203.06316): the QMDP weighs each frontier as if it were the only goal, and
 drives by a small opening on the way to a large one far away, to come back for it later. Here the order of the visits
-counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the part of risk
-in the paper's cost of a leg. The way itself counts by what it delays: all is to be visited, and a discounted cost of
-the way would be a reason to put off the long leg, for whatever crumb is nearer.
+counts: V = sum over k of gamma^D_k gain_k - gamma^D_(k-1) C_k, with D the distance driven so far and C the paper's cost
+of a leg.
 """
 
 from __future__ import annotations
@@ -21,6 +20,8 @@ from services.gcp.roadnet import RoadNet
 
 _NEXT_OF_GROUP = 0.3
 """Frontiers of a group mostly look at the same unseen ground: the best one counts whole, the others so much."""
+_OF_A_GROUP = 8
+"""So many frontiers for each group are looked for near the robot."""
 _NEAR_COST = 0.5
 """Ways that cost less are equally near when gain is weighed by cost, nats: ten metres."""
 
@@ -35,40 +36,36 @@ class Groups(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """Legs of a tour: cost (of risk), discount (gamma^distance), way: what the distance itself costs, (k + 1, k): row k
-    from the robot. inf, 0 and 0 without a way.
-    """
+    """Legs of a tour: cost, discount (gamma^distance), (k + 1, k): row k from the robot. inf and 0 without a way."""
 
     cost: Floats
     discount: Floats
-    way: Floats
 
 
 class Tour(NamedTuple):
-    """An order of the groups and its value, and less what the way costs: net; empty when none can be reached."""
+    """An order of the groups and its value; empty when none can be reached."""
 
     order: NDArray[np.int64]
     value: float
-    net: float = -np.inf
 
 
 class Outlook(NamedTuple):
-    """Where the best tour begins: slot of a frontier (-1: no tour), its value, net: less the way's cost too, and the
-    value of the best tour that begins with the frontier held (-inf: none)."""
+    """Where the best tour begins: slot of a frontier (-1: no tour), its value, and that of the best tour that begins
+    with the frontier held (-inf: none)."""
 
     first: int = -1
     value: float = -np.inf
-    net: float = -np.inf
     kept_value: float = -np.inf
 
 
 @njit
 def ways_from(
-    net: Net, source: int, wanted: NDArray[np.bool_], count: int, cost: Floats, distance_m: Floats
+    net: Net, source: int, wanted: NDArray[np.bool_], count: int, held: int, cost: Floats, distance_m: Floats
 ) -> None:
     """Cheapest ways (undiscounted cost) from a slot to the wanted frontiers, by slot, until `count` of them are found.
 
-    Ways do not pass through frontiers. cost: (n,) out, inf where no way was found. distance_m: (n,) out, along it.
+    held: one that is among them in any case; -1: none. Ways do not pass through frontiers. cost: (n,) out, inf where no
+    way was found. distance_m: (n,) out, along it.
     """
     n = net.node_id.shape[0]
     heap, place = np.empty(n, np.int32), np.full(n, -1, np.int32)
@@ -76,7 +73,7 @@ def ways_from(
     distance_m[source] = 0.0
     size = heap_push_or_lower(heap, place, cost, 0, source, 0.0)
     done = np.zeros(n, np.bool_)
-    while size > 0 and count > 0:
+    while size > 0 and (count > 0 or (held >= 0 and not done[held])):
         node = heap_pop(heap, place, cost, size)
         size -= 1
         done[node] = True
@@ -178,13 +175,13 @@ def best_tour(gain: Floats, legs: Legs, first: int = -1) -> Tour:
 
     By local search (moves of single stops, turns of stretches) from the greedy order.
     """
-    cost, discount, way = legs
+    cost, discount = legs
     reached = np.isfinite(cost[-1])
     if not reached.any() or (first >= 0 and not reached[first]):
         return Tour(np.zeros(0, np.int64), -np.inf)
     order = _greedy(first, reached, gain, cost, discount)
     value = improve(order, 1 if first >= 0 else 0, gain, cost, discount)
-    return Tour(order, float(value), float(tour_value(order, gain, cost + way, discount)))
+    return Tour(order, float(value))
 
 
 def group_frontiers(
@@ -253,9 +250,10 @@ class Visits:
         frontiers = roads.frontier_slots()
         if frontiers.size == 0:
             return Outlook()
-        away, _ = self._ways(start, frontiers)
+        away, _ = self._ways(start, frontiers, _OF_A_GROUP * self._most, held)
         outlook = self._over(start, held, frontiers, away, 0)
-        if outlook.net < self._near_worth:
+        if outlook.value < self._near_worth:
+            away, _ = self._ways(start, frontiers)
             outlook = self._over(start, held, frontiers, away, self._most)
         return outlook
 
@@ -275,23 +273,23 @@ class Visits:
         )
         if kept.value > tour.value:  # the search of the free tour ended in a worse place
             tour = kept
-        return Outlook(int(groups.slot[tour.order[0]]), tour.value, tour.net, kept.value)
+        return Outlook(int(groups.slot[tour.order[0]]), tour.value, kept.value)
 
-    def _ways(self, source: int, targets: Slots) -> tuple[Floats, Floats]:
+    def _ways(
+        self, source: int, targets: Slots, most: int | None = None, held: int = -1
+    ) -> tuple[Floats, Floats]:
+        """Cost and length of the ways to the `most` nearest targets (all) and the one held; inf and 0 of others."""
         net = self._roads.net
         wanted = np.zeros(net.node_id.size, np.bool_)
         wanted[targets] = True
         cost, distance_m = np.empty(net.node_id.size), np.zeros(net.node_id.size)
-        ways_from(net, source, wanted, int(targets.size), cost, distance_m)
+        count = int(targets.size) if most is None else min(most, int(targets.size))
+        ways_from(net, source, wanted, count, held if held >= 0 and wanted[held] else -1, cost, distance_m)
         return cost[targets], distance_m[targets]
 
     def _legs(self, start: int, stops: Slots) -> Legs:
-        shape, w = (stops.size + 1, stops.size), self._roads.weights
-        cost, discount, way = np.full(shape, np.inf), np.zeros(shape), np.zeros(shape)
+        cost, discount = np.full((stops.size + 1, stops.size), np.inf), np.zeros((stops.size + 1, stops.size))
         for row, source in enumerate([*stops.tolist(), start]):
-            total, distance_m = self._ways(source, stops)
-            reached = np.isfinite(total)
-            way[row, reached] = w.k_cost * w.k_distance_per_m * distance_m[reached]
-            cost[row, reached] = np.maximum(total - way[row], 0.0)[reached]
-            discount[row, reached] = self._gamma ** distance_m[reached]
-        return Legs(cost, discount, way)
+            cost[row], distance_m = self._ways(source, stops)
+            discount[row] = self._gamma**distance_m
+        return Legs(cost, discount)

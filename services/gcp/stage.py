@@ -372,4 +372,5 @@ def warm_up() -> None:
         planner.policy(roads.near(np.zeros(3), 2.0), np.zeros(3), 0.5)
         planner.way_home(middle, roads.slot_of(1))
         frontier_options(roads, middle, (), 1.0, 1.0, 1, ())
+        Visits(roads, 0.99, 1.0, 2, 0.0).first(middle, -1)
     move_pool(roads.net, empty_net(0, 2 * roads.net.other.size))  # what a graph does that outgrows its pool

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from planning.clusters import component_centroids, label_components
 from planning.coverage import LOG_2
@@ -13,6 +15,9 @@ from planning.grid import FREE
 from planning.kernels import njit
 from services.irm.config import Config
 from services.irm.window import Window
+
+_JOINED_M = 0.4
+"""Less than what lies between the two sides of a wall, where the robot's centre fits: nothing is joined through one."""
 
 
 class Found(NamedTuple):
@@ -47,8 +52,7 @@ def find_frontiers(window: Window, config: Config, least: float | None = None) -
     least = config.frontier_min_gain if least is None else least
     if config.coverage == "known":
         return _find_behind(window, config, least)
-    openings = window.reachable & (window.state == FREE) & beside(window.hopeful)
-    openings &= near_robot(window, config.opening_range_m)
+    openings = joined_openings(window, config.opening_range_m)
     open_ground = (window.uncovered & (window.state == FREE)) | openings
     behind = np.zeros(s.shape, np.int32)
     sizes = component_centroids(behind, label_components(window.hopeful, behind))[0]
@@ -76,7 +80,7 @@ def _find_behind(window: Window, config: Config, least: float) -> list[Found]:
 
 class _Blocks(NamedTuple):
     """Blocks of a border: gain of the ground that counts for each, nats, hidden: the cells that may lie behind it,
-    mouth: those of its own cells that border on them, (b,) each; places: (b, 2) cells; piece_of: (b,), the connected
+    mouth: the width of the border with them, cells, (b,) each; places: (b, 2) cells; piece_of: (b,), the connected
     piece it belongs to."""
 
     gain: NDArray[np.float64]
@@ -115,6 +119,21 @@ def _blocks_of(
     piece_of, inside = np.zeros(blocks, np.int64), block >= 0
     piece_of[block[inside]] = labels[inside]
     return _Blocks(gain, hidden, mouth, places, piece_of)
+
+
+def joined_openings(window: Window, range_m: float) -> NDArray[np.bool_]:
+    """Reachable cells at the border of ground never seen that the robot may enter, within a distance of the robot.
+
+    With what lies within `_JOINED_M` of them: the edge of what is seen is ragged, and the mouth of a passage, in ten
+    pieces, would be ten openings as wide as a cell.
+    """
+    here = window.reachable & (window.state == FREE)
+    rim = here & beside(window.hopeful) & near_robot(window, range_m)
+    steps = round(_JOINED_M / window.spec.resolution_m)
+    if steps < 1 or not rim.any():
+        return rim
+    joined: NDArray[np.bool_] = here & ndimage.binary_dilation(rim, np.ones((3, 3), np.bool_), steps)
+    return joined
 
 
 def near_robot(window: Window, range_m: float) -> NDArray[np.bool_]:
@@ -253,12 +272,14 @@ def block_gains(
     mouth: NDArray[np.float64],
 ) -> None:
     """Entropy of each block's cells, the size of the largest piece of hopeful ground that they border on (hidden), and
-    how many of them do (mouth).
+    how far from one another those are that do (mouth, cells: the border is ragged, so that their number says less).
 
     behind: (h, w) labels of the pieces of hopeful ground, 0 elsewhere. sizes: cells of piece k + 1. sums: (blocks, 3):
     number of cells, sum of rows, sum of columns.
     """
     height, width = block.shape
+    low_row, high_row = np.full(mouth.shape[0], height), np.full(mouth.shape[0], -1)
+    low_column, high_column = np.full(mouth.shape[0], width), np.full(mouth.shape[0], -1)
     for row in range(height):
         for column in range(width):
             b = block[row, column]
@@ -274,7 +295,12 @@ def block_gains(
                 if r >= 0 and c >= 0 and r < height and c < width and behind[r, c] > 0:
                     hidden[b] = max(hidden[b], float(sizes[behind[r, c] - 1]))
                     opens = 1
-            mouth[b] += opens
+            if opens:
+                low_row[b], high_row[b] = min(low_row[b], row), max(high_row[b], row)
+                low_column[b], high_column[b] = min(low_column[b], column), max(high_column[b], column)
+    for b in range(mouth.shape[0]):
+        if high_row[b] >= 0:
+            mouth[b] = 1.0 + math.hypot(high_row[b] - low_row[b], high_column[b] - low_column[b])
 
 
 @njit

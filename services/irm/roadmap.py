@@ -100,7 +100,7 @@ class Roadmap:
         self.trail.note(x_m, y_m)
         self._drop_breadcrumb(search, x_m, y_m, anchor)
         self._sync_frontiers(window)
-        self._join_back()
+        self._join_back(search)
         self._join_robot(search)
         self._join_frontiers(window)
         self._give_up_isolated(now_ns)
@@ -140,8 +140,11 @@ class Roadmap:
         meets = placed.forbids_lines(points[:, 0], points[:, 1])
         return {keys[i] for i in np.flatnonzero(meets).tolist()}
 
-    def _join_back(self) -> None:
-        """Frontiers that came back are joined to what lies near, as if there were a way: beside them it is seen."""
+    def _join_back(self, search: Search) -> None:
+        """Frontiers that came back are joined to what lies near, as if there were a way: beside them it is seen.
+
+        Not through what stands in between for all to see.
+        """
         for node in [n for n in self._back if n in self.graph]:
             x, y = self.road.place(node)
             z = self.graph.nodes[node]["z"]
@@ -150,7 +153,8 @@ class Roadmap:
             around = self.road.near(x, y, z, reach_m, BREADCRUMB)
             for other in [n for _, n in around if self._is_certain(n) == certain][:3]:
                 straight = max(self.road.straight_m(node, other), 1e-3)
-                if not self._is_fenced(node, other):
+                seen_shut = search.obstacle_on([(x, y), self.road.place(other)])
+                if not self._is_fenced(node, other) and not seen_shut:
                     self.road.set_edge(node, other, _GUESSED_TIMES * straight, _GUESSED_RISK, 0)
         self._back = []
 

@@ -30,7 +30,7 @@ GAMMA = RewardWeights().gamma_per_m
 def plane_legs(places: np.ndarray) -> Legs:
     """Legs between points of the plane, the last of which is the robot's."""
     distance_m = np.linalg.norm(places[:, None, :] - places[None, :-1, :], axis=2)
-    return Legs(0.05 * distance_m, GAMMA**distance_m, np.zeros_like(distance_m))
+    return Legs(0.05 * distance_m, GAMMA**distance_m)
 
 
 def by_hand(order: tuple[int, ...], gain: np.ndarray, places: np.ndarray) -> float:
@@ -66,7 +66,7 @@ def test_improving_never_makes_a_tour_worse() -> None:
     rng = np.random.default_rng(3)
     for _ in range(30):
         places, gain = rng.uniform(-40, 40, (9, 2)), rng.uniform(0.3, 30.0, 8)
-        cost, discount, _ = plane_legs(places)
+        cost, discount = plane_legs(places)
         order = rng.permutation(8)
         fixed, before = order[:2].copy(), tour_value(order, gain, cost, discount)
         after = improve(order, 2, gain, cost, discount)
@@ -89,7 +89,7 @@ def test_ways_do_not_lead_through_frontiers() -> None:
     n = roads.net.node_id.size
     wanted, cost, distance_m = np.zeros(n, np.bool_), np.empty(n), np.zeros(n)
     wanted[roads.frontier_slots()] = True
-    ways_from(roads.net, roads.slot_of(1), wanted, 2, cost, distance_m)
+    ways_from(roads.net, roads.slot_of(1), wanted, 2, -1, cost, distance_m)
     assert distance_m[roads.slot_of(2)] == 5.0
     assert cost[roads.slot_of(3)] == np.inf
 
@@ -131,8 +131,7 @@ def test_frontiers_side_by_side_are_one_stop_and_what_cannot_be_reached_is_none(
     roads = road(nodes, edges)
     look = Visits(roads, GAMMA, 4.0, 16, 0.0).first(roads.slot_of(1), roads.slot_of(12))
     gain = 3.0 + 0.3 * 12.0
-    assert look.value == pytest.approx(GAMMA**8 * gain)
-    assert look.net == pytest.approx(GAMMA**8 * gain - 0.05 * 8.0)
+    assert look.value == pytest.approx(GAMMA**8 * gain - 0.05 * 8.0)
     assert look.kept_value == pytest.approx(look.value)
     assert Visits(road({1: nodes[1]}, {}), GAMMA, 4.0, 16, 0.0).first(0, -1) == Outlook()
     assert Visits(road({1: nodes[1], 9: nodes[9]}, {}), GAMMA, 4.0, 16, 0.0).first(0, -1) == Outlook()
@@ -157,3 +156,23 @@ def test_slivers_at_hand_do_not_hide_the_field_far_away(near_worth: float) -> No
         "the nearest, then the most for the way"
     )
     assert near.of[roads.slot_of(32)] == 4
+
+
+def test_the_frontier_held_is_found_beyond_the_nearest_ones() -> None:
+    nodes: dict[int, Node] = {
+        1: (CRUMB, 0.0, 0.0, 0.0),
+        2: (CRUMB, 20.0, 0.0, 0.0),
+        3: (CRUMB, 40.0, 0.0, 0.0),
+    }
+    edges = {(1, 2): (20.0, 0.0), (2, 3): (20.0, 0.0)}
+    for crumb in (1, 2, 3):
+        nodes[10 + crumb] = (FRONTIER, 20.0 * (crumb - 1), 3.0, 1.0)
+        edges[crumb, 10 + crumb] = (3.0, 0.0)
+    roads = road(nodes, edges)
+    n = roads.net.node_id.size
+    wanted = np.zeros(n, np.bool_)
+    wanted[roads.frontier_slots()] = True
+    for held, found in ((-1, [11]), (roads.slot_of(12), [11, 12]), (roads.slot_of(13), [11, 12, 13])):
+        cost, distance_m = np.empty(n), np.zeros(n)
+        ways_from(roads.net, roads.slot_of(1), wanted, 1, held, cost, distance_m)
+        assert [k for k in (11, 12, 13) if np.isfinite(cost[roads.slot_of(k)])] == found

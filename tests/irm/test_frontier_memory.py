@@ -94,6 +94,18 @@ def test_covered_ground_at_the_edge_of_the_unseen_is_a_frontier_and_beside_a_wal
     assert 2.0 <= width_m <= 3.0, "of the corridor, where the robot's centre fits"
 
 
+def test_a_ragged_edge_of_the_unseen_is_one_opening() -> None:
+    """Beams end where they end: every other row of cells is seen two cells farther."""
+    scene = Scene()
+    scene.flat.fill(4.0, 0.0, 9.0, 5.0, UNKNOWN)
+    for row in range(4):
+        low = 1.4 + 0.6 * row
+        scene.flat.fill(4.0, low, 4.4, low + 0.2, FREE)
+    found = scene.find()
+    assert len(found) == 1
+    assert found[0].gain > 2.0 * LOG_2 * scene.config.opening_depth_m, "most of the corridor's width"
+
+
 @pytest.mark.parametrize(("most", "gain"), [(2.0, 2.0), (1.0, 1.0), (0.1, 0.4)])
 def test_the_unseen_counts_up_to_a_limit_and_at_least_as_an_opening(most: float, gain: float) -> None:
     scene = Scene(unknown_max_gain=most, frontier_enough_gain=0.4)

@@ -78,7 +78,8 @@ def open_of(window: Window) -> NDArray[np.bool_]:
     away = np.hypot(rows - window.robot_cell[0], columns - window.robot_cell[1]) * window.spec.resolution_m
     near = away <= CONFIG.opening_range_m
     edge = near & window.reachable & (window.state == FREE) & _brute_edge(window)
-    found: NDArray[np.bool_] = (window.uncovered & (window.state == FREE)) | edge
+    joined = window.reachable & (window.state == FREE) & ndimage.binary_dilation(edge, EIGHT)
+    found: NDArray[np.bool_] = (window.uncovered & (window.state == FREE)) | joined
     return found
 
 
@@ -178,8 +179,9 @@ def _brute_hidden(window: Window, cells: NDArray[np.bool_]) -> float:
 
 
 def _brute_mouth_m(window: Window, cells: NDArray[np.bool_]) -> float:
-    """Width of these cells that has a side in common with hopeful ground, m."""
-    return float((cells & ndimage.binary_dilation(window.hopeful, CROSS)).sum()) * RES
+    """How far apart those of these cells are that have a side in common with hopeful ground, m."""
+    touching = np.argwhere(cells & ndimage.binary_dilation(window.hopeful, CROSS))
+    return float(1.0 + np.hypot(*np.ptp(touching, axis=0))) * RES if len(touching) else 0.0
 
 
 def _gains(

@@ -5,13 +5,14 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plgrim.config import RuntimeConfig
 from plgrim.link.arbiter import Arbiter, ToPublish, note_robot
 from plgrim.link.config import LinkConfig
-from plgrim.link.in_step import Seen
+from plgrim.link.in_step import UNKNOWN_NS, Seen
 from plgrim.link.lease import BASE, STANDBY
 from plgrim.runtime.keeper import next_epoch
 from plgrim.runtime.mailbox import Mailbox
@@ -52,7 +53,12 @@ class _World:
         self.passed: list[tuple[int, int]] = []
         """(version of the graph, ms) of each policy that readers accepted."""
 
-    def robot(self) -> None:
+    def restart_link(self) -> None:
+        """A new life of the link process: it knows nothing of what was said."""
+        self.seen = Seen()
+        self.arbiter = Arbiter.of("gcp", "robot", CONFIG, self.seen, epoch=2000)
+
+    def robot(self, irm_epoch: int = 3) -> None:
         """The robot says where it is, and a new graph."""
         now_ns = self.now_ms * MS
         self.odometry += 1
@@ -60,7 +66,7 @@ class _World:
         self.graph_at_ms[self.version] = self.now_ms
         graph = global_irm(now_ns, self.version, self.version - 1)
         moved = Envelope("robot", "sim", 3, self.odometry, now_ns)
-        drawn = Envelope("robot", "irm", 3, self.version, now_ns)
+        drawn = Envelope("robot", "irm", irm_epoch, self.version, now_ns)
         note_robot(self.seen, ODOMETRY, odometry(now_ns, 0.0), moved, now_ns)
         note_robot(self.seen, GLOBAL_IRM, graph, drawn, now_ns)
 
@@ -71,13 +77,14 @@ class _World:
         message: Message,
         knows: tuple[int, int] | None = None,
         epoch: int = 1,
+        irm_epoch: int = 3,
     ) -> None:
         """An instance says something. knows: (odometry, graph) heard by then; as new as can be without."""
         count = self.sequence[instance, topic.name, epoch] = (
             self.sequence.get((instance, topic.name, epoch), 0) + 1
         )
         heard = knows or (self.odometry, self.version)
-        consumed = {"sim/odometry": (3, heard[0]), "irm/global_irm": (3, heard[1])}
+        consumed = {"sim/odometry": (3, heard[0]), "irm/global_irm": (irm_epoch, heard[1])}
         payload = encode(message, Envelope("robot", "gcp", epoch, count, 0, consumed))
         self.hand_on(self.arbiter.receive(instance, topic, payload, self.now_ms * MS, 0))
 
@@ -200,6 +207,57 @@ def test_an_instance_that_is_not_ready_gets_nothing() -> None:
     assert world.arbiter.lease.holder == STANDBY
 
 
+def _with_a_base_at(world: _World, version: int, seconds: int = 8) -> None:
+    """The base hears odometry, says that it is well, and holds a graph of its own."""
+    for _ in range(2 * seconds):
+        world.robot()
+        for instance, graph in ((STANDBY, world.version), (BASE, version)):
+            heard = (world.odometry, min(graph, world.version))
+            world.says(instance, HEALTH, _health(0))
+            world.says(instance, GLOBAL_POLICY, global_policy(0, graph), heard)
+        for _ in range(5):
+            world.now_ms += 100
+            world.hand_on(world.arbiter.tick(world.now_ms * MS, 0))
+
+
+@pytest.mark.parametrize("version", [5, 250, 5000])
+def test_a_link_that_restarts_passes_on_nothing_that_it_cannot_date(version: int) -> None:
+    """The base's graph is far behind, within what irm's cache tells a new reader, or of the mission before."""
+    world = _World()
+    world.odometry = world.version = 300
+    world.restart_link()
+    for old in range(240, 301):  # the cache of irm
+        drawn = Envelope("robot", "irm", 3, old, 0)
+        note_robot(world.seen, GLOBAL_IRM, global_irm(0, old, old - 1), drawn, old * 1000)
+    _with_a_base_at(world, version)
+    assert world.passed and version not in {passed for passed, _ in world.passed}
+    for _ in range(6):
+        world.second()
+    assert world.arbiter.lease.holder == BASE
+
+
+def test_a_life_of_irm_that_counts_anew_is_followed() -> None:
+    """What the base says of the new graph is passed on, what it says of the old one is not."""
+    world = _World()
+    world.version = 300
+    for _ in range(5):
+        world.second()
+    assert world.arbiter.lease.holder == BASE
+    world.version, before_ms = 0, world.now_ms
+    for _ in range(10):
+        world.robot(irm_epoch=4)
+        for instance in (STANDBY, BASE):
+            for topic, message in ((HEALTH, _health(0)), (GLOBAL_POLICY, global_policy(0, world.version))):
+                world.says(instance, topic, message, irm_epoch=4)
+        world.now_ms += 1000
+        world.hand_on(world.arbiter.tick(world.now_ms * MS, 0))
+    assert world.arbiter.lease.holder == BASE
+    assert world.arbiter.dropped == {}
+    world.says(BASE, GLOBAL_POLICY, global_policy(0, 305), irm_epoch=4)
+    assert world.arbiter.dropped == {"base/gcp/global_policy:behind": 1}
+    assert {version for version, at_ms in world.passed if at_ms >= before_ms} == set(range(1, 11))
+
+
 def test_old_lives_and_repetitions_are_dropped_and_counted() -> None:
     world = _World()
     world.robot()
@@ -215,6 +273,29 @@ def test_old_lives_and_repetitions_are_dropped_and_counted() -> None:
         "base/gcp/global_policy:malformed": 1,
     }
     assert world.passed == []
+
+
+def test_a_base_that_was_replaced_is_obeyed_whatever_its_clock_says() -> None:
+    """Its epochs are earlier than those of the one before it, which is silent now; the one that speaks is not
+    displaced."""
+    world = _World()
+    for _ in range(10):
+        world.second()
+    assert world.arbiter.lease.holder == BASE
+    world.says(BASE, GLOBAL_POLICY, global_policy(0, world.version), epoch=0)
+    assert world.arbiter.dropped == {"base/gcp/global_policy:wrong_sender": 1}
+    replaced_ms, obeyed_ms = world.now_ms, -1
+    for _ in range(12):
+        world.robot()
+        for instance, epoch in ((STANDBY, 1), (BASE, 0)):
+            world.says(instance, HEALTH, _health(0), epoch=epoch)
+            world.says(instance, GLOBAL_POLICY, global_policy(0, world.version), epoch=epoch)
+        world.now_ms += 500
+        world.hand_on(world.arbiter.tick(world.now_ms * MS, 0))
+        if world.arbiter.lease.holder == BASE and world.arbiter.lease.epoch > 1001 and obeyed_ms < 0:
+            obeyed_ms = world.now_ms
+    assert world.arbiter.lease.holder == BASE
+    assert 2000 < obeyed_ms - replaced_ms <= 5500
 
 
 def test_requests_for_the_graph_pass_whoever_asks() -> None:
@@ -251,14 +332,27 @@ def test_whatever_happens_nothing_stale_is_passed(seconds: list[tuple[bool, bool
 def test_behind_is_measured_by_the_clock_of_the_robot_alone() -> None:
     seen = Seen()
     for number in range(2000):
-        seen.note("a", (1, number), 10 * number)
-    assert seen.behind_ns("a", (1, 1999), 30_000) == 0
-    assert seen.behind_ns("a", (1, 1998), 30_000) == 30_000 - 19_990
-    assert seen.behind_ns("a", (0, 5), 30_000) > 5_000
-    assert seen.behind_ns("a", (2, 0), 30_000) == 0
-    assert seen.behind_ns("b", (1, 1), 30_000) == 0
-    seen.note("a", (1, 7), 40_000)
-    assert seen.behind_ns("a", (1, 1999), 50_000) == 0
+        seen.note("a", (1, number), 10 * MS * number)
+    now_ns = 30_000 * MS
+    assert seen.behind_ns("a", (1, 1999), now_ns) == 0
+    assert seen.behind_ns("a", (1, 1998), now_ns) == now_ns - 19_990 * MS
+    for unseen in ((0, 5), (1, 3), (2, 0)):  # of another life, older than what is kept, of the future
+        assert seen.behind_ns("a", unseen, now_ns) == UNKNOWN_NS
+    assert seen.behind_ns("b", (1, 1), now_ns) == UNKNOWN_NS
+    seen.note("a", (1, 7), 40_000 * MS)
+    assert seen.behind_ns("a", (1, 1999), 50_000 * MS) == 0
+
+
+def test_of_a_cache_that_is_told_at_once_only_the_newest_is_new() -> None:
+    """A reader that joins late hears what was said before all at once: when each was new it does not know."""
+    seen = Seen()
+    for number in range(64):
+        seen.note("a", (1, number), number * MS)
+    seen.note("a", (1, 64), 1000 * MS)
+    seen.note("a", (1, 65), 1050 * MS)
+    assert seen.behind_ns("a", (1, 62), 1100 * MS) == UNKNOWN_NS
+    assert seen.behind_ns("a", (1, 63), 1100 * MS) == 100 * MS
+    assert seen.behind_ns("a", (1, 64), 1100 * MS) == 50 * MS
 
 
 def test_a_link_that_restarts_after_the_clock_was_set_back_is_heard(tmp_path: Path) -> None:

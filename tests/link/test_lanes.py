@@ -65,6 +65,44 @@ def test_full_queues_drop_the_oldest_but_differences_all() -> None:
     assert _drain(lane) == [bytes([n]) for n in (*range(5, 15), *range(11, 15))]
 
 
+def test_a_whole_is_never_dropped_and_its_differences_follow_it() -> None:
+    """A graph larger than what may wait: a reader that asked for it and never got it would ask for ever."""
+    lane = _lane(limit=100)
+    lane.offer(Parcel(GLOBAL_IRM, b"d" * 90))
+    lane.offer(Parcel(GLOBAL_IRM, b"W" * 300, whole=True))
+    assert lane.dropped["irm/global_irm"] == 0, "what the whole contains is not lost"
+    for number in range(3):
+        lane.offer(Parcel(GLOBAL_IRM, bytes([number]) * 30))
+    assert [payload[:1] for payload in _drain(lane)] == [b"W", b"\x00", b"\x01", b"\x02"]
+
+    lane.offer(Parcel(GLOBAL_IRM, b"W" * 300, whole=True))
+    for number in range(5):
+        lane.offer(Parcel(GLOBAL_IRM, bytes([number]) * 30))
+    assert [payload[:1] for payload in _drain(lane)] == [b"W", b"\x04"], "differences go, the whole stays"
+    assert lane.dropped["irm/global_irm"] == 4
+
+
+def test_of_two_wholes_the_newer_waits() -> None:
+    lane = _lane(limit=10)
+    for name in (b"1", b"2"):
+        lane.offer(Parcel(GLOBAL_IRM, name * 300, whole=True))
+        lane.offer(Parcel(GLOBAL_IRM, name))
+    assert _drain(lane) == [b"2" * 300, b"2"]
+
+
+def test_what_was_put_back_comes_first_of_its_topic_and_holds_no_other() -> None:
+    lane = _lane()
+    for payload in (b"1", b"2"):
+        lane.offer(Parcel(COMMAND, payload))
+    first = lane.take(0)[0]
+    assert first is not None
+    lane.put_back(first, 100 * MS)
+    lane.offer(Parcel(ODOMETRY, b"o"))
+    assert _drain(lane, 0) == [b"o"]
+    assert lane.take(60 * MS) == (None, 40 * MS)
+    assert _drain(lane, 100 * MS) == [b"1", b"2"]
+
+
 @given(st.lists(st.tuples(st.integers(0, 500), st.integers(1, 50_000)), min_size=1, max_size=60))
 def test_a_budget_is_kept_over_any_time(messages: list[tuple[int, int]]) -> None:
     bucket, now_ns, sent = Bucket(10_000.0), 0, []

@@ -10,6 +10,7 @@ from plgrim.link.config import LinkConfig
 from plgrim.link.routes import COMMANDS, MAPS, down, keys_written, lane_of, needs_every, up_plain
 from plgrim.link.uplink import base_router
 from schemas.topics import (
+    ANSWER,
     COMMAND,
     EPISODE,
     GLOBAL_IRM,
@@ -57,6 +58,7 @@ def test_every_message_only_where_a_reader_counts_on_it() -> None:
     assert needs_every(GLOBAL_IRM, _config("status"))
     assert not needs_every(LOCAL_IRM, _config("gcp", "status"))
     assert needs_every(LOCAL_IRM, _config("lcp"))
+    assert needs_every(ANSWER, _config("gcp", "status")), "an operator waits for each"
 
 
 def test_instances() -> None:

@@ -85,6 +85,61 @@ def test_it_goes_on_after_a_recovery(tmp_path: Path) -> None:
         journal.close()
 
 
+def _change(file: Path, statement: str) -> None:
+    connection = sqlite3.connect(file)
+    connection.execute(statement)
+    connection.commit()
+    connection.close()
+
+
+_DAMAGE = {
+    "nothing": ("s.b.sqlite", "SELECT 1", 6),
+    "the newer snapshot": ("s.b.sqlite", "UPDATE generation SET state = x'00'", 6),
+    "the last record": ("s.b.sqlite", "UPDATE record SET content = x'00' WHERE number = 6", 5),
+    "a record with another behind it": ("s.b.sqlite", "DELETE FROM record WHERE number = 5", 4),
+}
+
+
+@pytest.mark.parametrize("damage", _DAMAGE)
+def test_short_lives_append_to_what_was_found_and_leave_the_snapshots(tmp_path: Path, damage: str) -> None:
+    file, statement, known = _DAMAGE[damage]
+    journal = Journal(tmp_path, "s")
+    _write(journal, 2, 3)
+    journal.close()
+    _change(tmp_path / file, statement)
+    before = [state.snapshot for state in _recover(tmp_path)]
+    for life in range(3):
+        journal = Journal(tmp_path, "s")
+        found = journal.recover()
+        assert _meaning(found[0]) == known + 2 * life
+        assert journal.go_on(found[0])
+        for number in (1, 2):
+            journal.append(_record(known + 2 * life + number))
+        journal.close()
+    after = _recover(tmp_path)
+    assert [_meaning(state) for state in after] == [known + 6] * len(after)
+    assert [state.snapshot for state in after] == before
+
+
+def test_a_state_that_does_not_lead_to_the_newest_record_is_gone_on_from_by_a_snapshot(
+    tmp_path: Path,
+) -> None:
+    """The newer one cannot be restored, and between the two a record is missing: the older file stays."""
+    journal = Journal(tmp_path, "s")
+    _write(journal, 2, 3)
+    journal.close()
+    _change(tmp_path / "s.a.sqlite", "DELETE FROM record WHERE number = 2")
+    journal = Journal(tmp_path, "s")
+    _, older = journal.recover()
+    assert _meaning(older) == 1
+    assert not journal.go_on(older)
+    with pytest.raises(JournalError, match="begins with a snapshot"):
+        journal.append(b"")
+    journal.begin(_state(2), 9)
+    journal.close()
+    assert [state.snapshot for state in _recover(tmp_path)] == [_state(2), older.snapshot]
+
+
 def test_the_journal_of_a_long_run_stays_small(tmp_path: Path) -> None:
     journal = Journal(tmp_path, "s")
     journal.recover()

@@ -129,36 +129,99 @@ def test_a_state_that_cannot_be_restored_gives_way_to_the_one_before(tmp_path: P
         _live(keeper, stage, 2)
     found = _keeper(tmp_path, Watch()).recover(lambda: Counter(refuses=(b"5",)), 10)
     assert found.count == 6  # from the snapshot at 3, over the records of both generations
-    none = _keeper(tmp_path, Watch()).recover(lambda: Counter(refuses=(b"5", b"6", b"3")), 10)
-    assert (none.count, none.resumes) == (0, 0)
 
 
-def test_a_state_that_no_life_survives_is_not_restored_for_ever(tmp_path: Path) -> None:
+def test_what_is_acknowledged_is_not_written_over_by_a_stage_that_cannot_restore_it(tmp_path: Path) -> None:
+    """As after an upgrade, or with another configuration: the service does not run, whatever its next starts find."""
     first = _keeper(tmp_path, Watch())
     _live(first, first.recover(Counter, 0), 4)
+    for _ in range(3):
+        with pytest.raises(
+            JournalError, match=r"no state of mission leads on.*mission.tries.*mission\.\*\.sqlite"
+        ):
+            _keeper(tmp_path, Watch()).recover(lambda: Counter(refuses=(b"0",)), 10)
+    assert _keeper(tmp_path, Watch()).recover(Counter, 10).count == 4
+
+
+def _deaths(folder: Path, steps: list[int]) -> list[int]:
+    """Lives that die after so many steps; with which count each began."""
     counts = []
-    for steps in (
-        3,
-        0,
-        2,
-        0,
-        0,
-    ):  # the first of these lives gets going; the next three die in their first steps
-        keeper = _keeper(tmp_path, Watch())
+    for number in steps:
+        keeper = _keeper(folder, Watch())
         stage = keeper.recover(Counter, 10)
         counts.append(stage.count)
-        _live(keeper, stage, steps, 10)
-    assert counts == [4, 7, 7, 9, 0]
+        _live(keeper, stage, number, 10)
+    return counts
 
 
-def test_after_a_state_was_given_up_the_next_life_goes_on_from_what_came_since(tmp_path: Path) -> None:
-    """Three deaths at a start cost the state once, not at every later death."""
-    for steps in (50, 1, 1, 1, 60):
+def test_a_crash_loop_erases_nothing_that_was_acknowledged(tmp_path: Path) -> None:
+    """What each short life says is kept too; at the end the service fails, and what it knew is still there."""
+    assert _deaths(tmp_path, [4, 3, 0, 2, 0, 1, 1, 0]) == [0, 4, 7, 7, 9, 9, 10, 11]
+    for _ in range(3):
+        with pytest.raises(JournalError, match="does not begin anew"):
+            _keeper(tmp_path, Watch()).recover(Counter, 10)
+    (tmp_path / "mission.tries").unlink()
+    assert _deaths(tmp_path, [3, 0, 0]) == [11, 14, 14]
+
+
+def test_a_state_that_no_life_survives_gives_way_to_the_one_before(tmp_path: Path) -> None:
+    """Two short lives leave both generations as they were: the older one is there to be tried."""
+    watch = Watch()
+    keeper = _keeper(tmp_path, watch, period_s=1.0)
+    stage = keeper.recover(Counter, 0)
+    watch.now_s = 2.0
+    _live(keeper, stage, 2)  # the newer generation: a snapshot at 1, and a record
+    assert [s.snapshot for s in Journal(tmp_path, "mission").recover()] == [b"1", b"0"]
+    assert _deaths(tmp_path, [1, 0, 1]) == [2, 3, 3]
+    assert [s.snapshot for s in Journal(tmp_path, "mission").recover()] == [b"1", b"0"]
+    seen: list[bytes] = []
+
+    class Telling(Counter):
+        def restore(self, snapshot: bytes) -> None:
+            seen.append(snapshot)
+            super().restore(snapshot)
+
+    assert _keeper(tmp_path, Watch()).recover(Telling, 10).count == 4
+    assert seen == [b"0"]
+
+
+def test_numbers_that_short_lives_gave_are_skipped_by_all_that_follow(tmp_path: Path) -> None:
+    _deaths(tmp_path, [4, 1, 1])
+    stage = _keeper(tmp_path, Watch()).recover(Counter, 10)
+    assert stage.resumes == 3
+
+
+def test_an_orderly_end_in_the_first_steps_is_no_death(tmp_path: Path) -> None:
+    _deaths(tmp_path, [4])
+    for _ in range(8):
         keeper = _keeper(tmp_path, Watch())
-        stage = keeper.recover(Counter, 0)
-        _live(keeper, stage, steps)
-    assert stage.count == 60, "given up: as new"
-    assert _keeper(tmp_path, Watch()).recover(Counter, 0).count == 60
+        keeper.close(keeper.recover(Counter, 10), 10)
+    assert _deaths(tmp_path, [0]) == [4]
+
+
+class Plain:
+    """A stage with nothing to acknowledge."""
+
+    def __init__(self) -> None:
+        self.state = b"new"
+
+    def snapshot(self) -> bytes:
+        """The state."""
+        return self.state
+
+    def restore(self, snapshot: bytes) -> None:
+        """From a snapshot."""
+        self.state = snapshot
+
+
+def test_what_acknowledges_nothing_begins_anew_after_a_crash_loop(tmp_path: Path) -> None:
+    """Its state is worth less than its service: three deaths at a start cost it once, not at every later death."""
+    keeper = Keeper(Journal(tmp_path, "lcp"), 5.0, Watch())
+    stage = keeper.recover(Plain, 0)
+    stage.state = b"old"
+    keeper.close(stage, 0)
+    states = [Keeper(Journal(tmp_path, "lcp"), 5.0, Watch()).recover(Plain, 10).state for _ in range(5)]
+    assert states == [b"old", b"old", b"old", b"new", b"new"]
 
 
 def test_the_journal_of_a_mission_that_began_later_is_not_used(tmp_path: Path) -> None:

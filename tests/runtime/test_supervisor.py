@@ -15,13 +15,16 @@ from pathlib import Path
 import psutil
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
-from plgrim.config import Config
-from plgrim.errors import PortTakenError, ServiceFailedError
+from plgrim.cli import application
+from plgrim.config import Config, write_config
+from plgrim.errors import AlreadyRunningError, ConfigError, PortTakenError, ServiceFailedError
 from plgrim.hosts import host_and_port
 from plgrim.missions import run_live
 from plgrim.runtime.process import THREAD_LIMITS, child_environment
 from plgrim.runtime.router import check_endpoint_free
+from plgrim.runtime.run_folder import refuse_unfinished, with_kept_state
 from plgrim.runtime.supervisor import Supervisor, with_fresh_state
 from schemas.base import Message
 from schemas.codec import decode
@@ -124,6 +127,7 @@ def test_a_killed_service_goes_on_with_what_it_had_said(config: Config, tmp_path
         state = Path(supervisor.config.runtime.state_dir)
         assert state == tmp_path / "state"
         assert (state / "robot" / "mission.epoch").exists()
+        supervisor.finished = True
     assert not state.exists()
     ordered = sorted(heard, key=lambda item: (item[0], item[1].stamp_ns))
     counts_heard = [message.distance_m for _, message in ordered]
@@ -155,6 +159,35 @@ def test_each_run_begins_with_an_empty_state(config: Config, tmp_path: Path) -> 
     runtime = config.runtime.model_copy(update={"state_dir": str(tmp_path / "mine")})
     named = with_fresh_state(config.model_copy(update={"runtime": runtime}), tmp_path)
     assert Path(named.runtime.state_dir).parent == tmp_path / "mine"
+
+
+def test_the_state_of_a_mission_that_has_not_ended_is_kept(config: Config, tmp_path: Path) -> None:
+    """A host is shut down, or somebody presses Ctrl-C; started again, it does not begin anew without being told."""
+    with _supervisor(config, tmp_path, {"mission": "remembers"}) as supervisor:
+        supervisor.start()
+        supervisor.wait_ready(threading.Event())
+        state = Path(supervisor.config.runtime.state_dir)
+        with pytest.raises(AlreadyRunningError, match="a supervisor is at work"):
+            refuse_unfinished(tmp_path)
+    assert list(state.glob("robot/mission.*.sqlite"))
+    with pytest.raises(ConfigError, match=rf"plgrim recover {tmp_path}.*--new"):
+        refuse_unfinished(tmp_path)
+    found = CliRunner().invoke(application, ["up", "--out", str(tmp_path)])
+    assert isinstance(found.exception, ConfigError) and "--new" in str(found.exception)
+    assert list(state.glob("robot/mission.*.sqlite"))
+    assert with_kept_state(tmp_path).runtime.state_dir == str(state)
+
+
+def test_a_folder_without_a_mission_is_free(config: Config, tmp_path: Path) -> None:
+    refuse_unfinished(tmp_path / "new")
+    write_config(with_fresh_state(config, tmp_path), tmp_path / "config.yaml")
+    refuse_unfinished(tmp_path)
+    (tmp_path / "config.yaml").write_text("of: another version", encoding="utf-8")
+    refuse_unfinished(tmp_path)
+    (tmp_path / "state" / "robot").mkdir(parents=True)
+    (tmp_path / "state" / "robot" / "irm.a.sqlite").touch()
+    with pytest.raises(ConfigError, match="has not ended"):
+        refuse_unfinished(tmp_path)
 
 
 def test_a_killed_router_comes_back_and_the_services_find_it(config: Config, tmp_path: Path) -> None:
@@ -294,6 +327,7 @@ def test_a_mission_to_its_end_gives_a_result(config: Config, tmp_path: Path) -> 
     for name in ("result.json", "trajectory.csv", "coverage.png", "map.png", "config.yaml"):
         assert (tmp_path / name).stat().st_size > 0
     assert json.loads((tmp_path / "result.json").read_text(encoding="utf-8")) == result
+    assert not (tmp_path / "state").exists(), "nobody goes on with a mission that has ended"
 
 
 def test_a_stop_before_the_end_gives_a_result_that_says_so(config: Config, tmp_path: Path) -> None:
