@@ -193,8 +193,8 @@ def test_a_cut_is_survived_and_mended(
 ) -> None:
     """A cut of 10 s: no local gap, takeover within 5 s, nothing stale, one graph within 5 s (15 s with loss).
 
-    secured: over mutual TLS, each process with its own certificate and no more than the table of topics allows it. There
-    the lane of maps was seen to come back some 5 s later than over TCP, hence the graph and the lease: 15 s, too.
+    secured: over mutual TLS, each process with its own certificate and no more than the table of topics allows it.
+    There the lane of maps was seen to come back some 5 s later than over TCP, hence the graph and the lease: 15 s, too.
     """
     network.rate(10.0)
     if loss:
