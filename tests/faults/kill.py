@@ -130,6 +130,7 @@ class Killer:
                     break
                 time.sleep(0.02)
             self._settle(supervisor)
+            supervisor.finished = bool(self._observer.finish)
         return self._mission(time.monotonic() - began)
 
     def _wait_for_next(self) -> None:
