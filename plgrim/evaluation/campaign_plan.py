@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from plgrim.config import Config, check_all, load_config
+from plgrim.config import PAPER, Config, check_all, load_config
 from plgrim.errors import ConfigError
 from plgrim.registry import STAGES
 
@@ -35,11 +35,9 @@ BUILT_IN_VARIANTS: Mapping[str, Overlay] = {
     "paper": {"planner": "paper"},
     "uniform_rollouts": {"lcp": {"rollout_random": 1.0}},
     "single_moves": {"lcp": {"macros": False}},
-    "best_frontier": {
-        "gcp": {"solver": "qmdp", "switch_margin": 0.0, "switch_margin_relative": 0.0, "crumb_margin": 0.0}
-    },
+    "best_frontier": {"gcp": PAPER["gcp"]},
     "qmdp": {"gcp": {"solver": "qmdp"}},
-    "literal_tau": {"reconciler": {"profile": "paper"}},
+    "literal_tau": {"reconciler": PAPER["reconciler"]},
     "risk_neutral": {"riskmap": {"cvar_alpha": 0.0}, **_NO_K_RISK},
     "risk_blind": {"riskmap": {"risk_blind": True}, **_NO_K_RISK},
 }

@@ -250,16 +250,21 @@ class Visits:
         frontiers = roads.frontier_slots()
         if frontiers.size == 0:
             return Outlook()
-        away, _ = self._ways(start, frontiers, _OF_A_GROUP * self._most, held)
-        outlook = self._over(start, held, frontiers, away, 0)
-        if outlook.value < self._near_worth:
-            away, _ = self._ways(start, frontiers)
-            outlook = self._over(start, held, frontiers, away, self._most)
+        near = _OF_A_GROUP * self._most
+        groups = self._groups(start, held, frontiers, near, 0)
+        outlook = self._over(start, held, groups)
+        all_weighed = frontiers.size <= near and groups.slot.size < self._most
+        if outlook.value < self._near_worth and not all_weighed:
+            outlook = self._over(start, held, self._groups(start, held, frontiers, None, self._most))
         return outlook
 
-    def _over(self, start: int, held: int, frontiers: Slots, away: Floats, far: int) -> Outlook:
-        """The tour over the nearest groups and `far` of the others."""
-        groups = group_frontiers(self._roads, frontiers, away, self._apart_m, self._most, held, far)
+    def _groups(self, start: int, held: int, frontiers: Slots, looked_for: int | None, far: int) -> Groups:
+        """The nearest groups among so many frontiers (None: all), and `far` of the others."""
+        away, _ = self._ways(start, frontiers, looked_for, held)
+        return group_frontiers(self._roads, frontiers, away, self._apart_m, self._most, held, far)
+
+    def _over(self, start: int, held: int, groups: Groups) -> Outlook:
+        """The tour over these groups."""
         if groups.slot.size == 0:
             return Outlook()
         legs = self._legs(start, groups.slot)
