@@ -37,8 +37,8 @@ def missions(
         typer.Option(
             metavar="NAME[=FILE]",
             help="Built in (default, paper, its single differences, risk_neutral, risk_blind), or a YAML file "
-            "that is laid over the configuration; again for more: all are compared with the first, in pairs of the same "
-            "world and seed.",
+            "that is laid over the configuration; again for more: all are compared with the first, in pairs of "
+            "the same world and seed.",
         ),
     ] = None,
     start: Annotated[
