@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from planning.bits import count_bits
 from planning.coverage_model import MAX_EDGE_RISK
-from planning.kernels import njit
+from planning.kernels import njit, njit_borrowing
 from planning.lattice_graph import PassableEdges, empty_heap, passable_edges, travel_costs_over
 
 _MAX_CLUSTERS = 400
@@ -31,6 +31,16 @@ class Groups(NamedTuple):
     cost: NDArray[np.float32]
     tile: NDArray[np.uint8]
     word: NDArray[np.uint64]
+
+
+@njit_borrowing
+def _seen_of_row(visible: NDArray[np.uint32], node: int, size: int, reach: int, row: int) -> int:
+    """The nodes of a row of the lattice that a node sees, a bit a column; none of a row out of range or outside."""
+    offset, shift = row - node // size + reach, node % size - reach
+    if offset < 0 or offset > 2 * reach or row >= size:
+        return np.uint64(0)  # type: ignore[return-value]  # the compiler's int
+    word = np.uint64(visible[node, offset])
+    return word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)  # type: ignore[return-value]
 
 
 @njit
@@ -58,13 +68,7 @@ def best_viewpoint(
                 continue
             count = 0
             for r in range(3):
-                offset = top + r - row + reach
-                if offset < 0 or offset > 2 * reach or top + r >= size:
-                    continue
-                shift = column - reach
-                word = np.uint64(visible[node, offset])
-                word = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
-                count += count_bits(word & words[r])
+                count += count_bits(_seen_of_row(visible, node, size, reach, top + r) & words[r])
             if count == 0:
                 continue
             score = count - 0.3 * math.hypot(row - middle_row, column - middle_column) + 100.0
@@ -84,15 +88,9 @@ def _see_block(
     seen: NDArray[np.uint64],
 ) -> None:
     """Move the nodes of a block that a node sees (whatever its heading) from `words` to `seen`, (3,) each."""
-    shift = node % size - reach
     for r in range(3):
-        seen[r] = np.uint64(0)
-        offset = top + r - node // size + reach
-        if 0 <= offset <= 2 * reach and top + r < size:
-            word = np.uint64(visible[node, offset])
-            word = word << np.uint64(shift) if shift >= 0 else word >> np.uint64(-shift)
-            seen[r] = word & words[r]
-            words[r] &= ~seen[r]
+        seen[r] = _seen_of_row(visible, node, size, reach, top + r) & words[r]
+        words[r] &= ~seen[r]
 
 
 @njit
